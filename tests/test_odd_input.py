@@ -1,12 +1,19 @@
 """What Python is given in place of what it should be: a path, a plug-in, a list, ...; either it is understood or one sentence says what to give."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 import tiny
+import torch
 from torch_checkpoints import splats
 
+from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import digest_of
-from mipmap_plugin.errors import SceneError, SettingsError
+from mipmap_plugin.errors import SceneError, SettingsError, ShapeError
+from mipmap_plugin.levels.finished import Ladder
 from mipmap_plugin.scenes import load_scene, write_cameras
 from mipmap_plugin.wrap import wrap_model
 
@@ -64,3 +71,38 @@ def test_splats_of_gsplat_in_memory_are_told_how_to_take_cameras_as_they_are(tmp
     with pytest.raises(SceneError, match=r"or give wrap_model the cameras themselves \(load_scene\(path\).cameras\)$"):
         wrap_model(splats(), cameras=scene)
     assert wrap_model(splats(), cameras=load_scene(scene).cameras).cameras
+
+
+def test_an_adapted_model_may_be_what_a_coarser_one_starts_from(adapted):
+    base = wrap_model(tiny.model(10), cameras=tiny.cameras(), backend="reference")
+    finer = FinerLevel(adapted.model, 1 / 2, "the model adapted to x0.5")
+    coarser, same, other = (base.adapt(1 / 4, start=start, steps=2, extra_views=0) for start in (adapted, finer, None))
+    assert coarser.report.validation == same.report.validation
+    assert coarser.report.validation != other.report.validation
+    with pytest.raises(SettingsError, match="start: it is made for what draws as the training did, and not for spark"):
+        base.adapt(1 / 4, start=adapted, viewer="spark")
+    with pytest.raises(SettingsError, match=r"start: x0\.5 is not finer than x0\.5"):
+        base.adapt(1 / 2, start=adapted)
+
+
+def test_a_path_of_photographs_is_told_what_reads_it():
+    with pytest.raises(SettingsError, match=r"images must be a Scene, got str; load_scene\(path\) reads one$"):
+        wrap_model(tiny.model(10), cameras=tiny.cameras()).adapt(2, images="scene")
+
+
+@pytest.mark.parametrize(("change", "sentence"), [
+    (dict(means=np.zeros((10, 3))), "means: expected a torch tensor, got ndarray"),
+    (dict(sh=None), "sh: expected a torch tensor, got NoneType"),
+    (dict(means=torch.tensor(1.0)), r"means: expected shape \[0, 3\], got \[\]"),
+])  # fmt: skip
+def test_what_are_no_splats_is_named(change, sentence):
+    with pytest.raises(ShapeError, match=sentence):
+        replace(tiny.gaussians(10), **change)
+
+
+def test_outputs_may_be_none(adapted):
+    assert adapted.render(adapted.views()[0], outputs=None).depth is None
+
+
+def test_a_ladder_is_a_line_in_a_notebook():
+    assert repr(Ladder(SimpleNamespace(levels=[1, 2]), None, None)) == "<Ladder: 2 levels>"

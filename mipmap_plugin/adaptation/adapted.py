@@ -14,6 +14,7 @@ from mipmap_plugin.adaptation import notebook
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, Validation
 from mipmap_plugin.adaptation.report import Report
+from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends import supersample
 from mipmap_plugin.backends.base import Backend, Rendered
@@ -64,7 +65,7 @@ class Adapted:
     written: dict[Path, float] = field(default_factory=dict)
 
     @usual_modes()
-    def render(self, camera: Camera, *, outputs: Sequence[str] = (), exposure: bool = False, viewer: str | None = None) -> Rendered:
+    def render(self, camera: Camera, *, outputs: Sequence[str] | None = (), exposure: bool = False, viewer: str | None = None) -> Rendered:
         """Render the view of a camera of the new scale, in one of the `viewers`; `outputs` and `exposure` as in `Wrapped.render`."""
         [camera] = checked([camera])
         outputs = as_outputs(outputs)
@@ -141,6 +142,16 @@ class Adapted:
 
     def _drawn_otherwise(self, path: Path) -> str:
         return "" if self.report.viewer else drawn_otherwise(path, self.model.trained)
+
+
+def as_start(start: Any, viewer: str | None) -> Any:
+    """What an adaptation for `viewer` starts from: of an adapted model, its splats. Raises SettingsError if that was made for another viewer."""
+    if not isinstance(start, Adapted):
+        return start
+    if start.report.viewer != viewer:
+        made, wanted = (name or "what draws as the training did" for name in (start.report.viewer, viewer))
+        raise SettingsError(f"start: it is made for {made}, and not for {wanted}; leave it out, or give the same viewer")
+    return FinerLevel(start.model, start.report.scale, f"the model adapted to x{start.report.scale:g}")
 
 
 @torch.no_grad()

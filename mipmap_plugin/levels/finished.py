@@ -14,13 +14,16 @@ from mipmap_plugin.levels.store import LevelStore
 from mipmap_plugin.limits import path_of
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Ladder:
     """A ladder in memory, whichever way its levels were made."""
 
     contents: Contents | DistanceContents
     _store: LevelStore
     _write: Callable[[Any, Path, bool], Path]  # contents, folder, whether to overwrite
+
+    def __repr__(self) -> str:
+        return f"<Ladder: {len(self.levels)} levels>"
 
     @property
     def levels(self) -> list[Level] | list[Adapted]:
