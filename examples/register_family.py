@@ -35,7 +35,7 @@ def load(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
     with np.load(path) as arrays:  # an adapted model is saved as a PLY
         if missing := set(NAMES) - set(arrays.files):
             raise CheckpointError(f"{path} lacks the arrays {', '.join(sorted(missing))}; export it again")
-        tensors = {name: torch.from_numpy(arrays[name]) for name in NAMES}
+        tensors = {name: torch.from_numpy(arrays[name]).float() for name in NAMES}
     return VanillaModel(tensors, origin=Origin(Path(path), folder=Path(path).parent))  # whose cameras.json is read
 
 

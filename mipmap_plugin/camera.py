@@ -29,6 +29,10 @@ DIGITS = 16
 POSE_TOLERANCE = 3e-2
 
 
+# OpenGL's camera looks along -z with y up, OpenCV's along +z with y down.
+OPENGL_TO_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64, device="cpu"))
+
+
 @dataclass(frozen=True, eq=False)
 class Camera:
     """One view of a pinhole camera, with the axes of OpenCV: x right, y down, z forward. The centers of pixels lie at +0.5.
@@ -65,8 +69,47 @@ class Camera:
     index: int | None = None
 
     def __post_init__(self) -> None:
+        self._check_view()
         self._check_intrinsics()
         object.__setattr__(self, "viewmat", self._pose())
+
+    @classmethod
+    def of_matrices(cls, viewmat: Any, K: Any, width: int, height: int, **others: Any) -> Camera:
+        """A camera of gsplat's matrices: `viewmat` [4, 4] from the world to the camera, and the intrinsics `K` [3, 3], in px.
+
+        `others`: further attributes, such as `name`. Raises SettingsError, ShapeError.
+        """
+        (fx, skew, cx), (zero, fy, cy) = _matrix("K", K, (3, 3)).tolist()[:2]
+        if skew or zero:
+            raise SettingsError(f"K: a pinhole has no skew, got {skew or zero:g} beside the focal lengths; leave it out")
+        return cls(width, height, fx, fy, cx, cy, viewmat, **others)
+
+    @classmethod
+    def of_opengl(cls, c2w: Any, K: Any, width: int, height: int, **others: Any) -> Camera:
+        """A camera of NeRF's and nerfstudio's poses: `c2w` [4, 4] or [3, 4] from the camera to the world, with y up and z backward.
+
+        `K` and `others` as in `of_matrices`. Raises SettingsError, ShapeError.
+        """
+        rows = 3 if hasattr(c2w, "__len__") and len(c2w) == 3 else 4
+        pose = torch.eye(4, dtype=torch.float64, device="cpu")
+        pose[:rows] = _matrix("c2w", c2w, (rows, 4))
+        if not pose.isfinite().all() or torch.linalg.det(pose) == 0:
+            raise SettingsError("c2w: the pose contains NaN or infinity, or cannot be inverted")
+        return cls.of_matrices(OPENGL_TO_OPENCV @ torch.linalg.inv(pose), K, width, height, **others)
+
+    def _check_view(self) -> None:
+        """Turn what is said of the view into text and numbers of Python. Raises SettingsError."""
+        if not isinstance(self.name, (str, Path)):
+            raise SettingsError(f"camera: name must be a text, got {self.name!r}")
+        object.__setattr__(self, "name", str(self.name))
+        if self.split not in ("train", "test"):
+            raise SettingsError(f"camera {self.name!r}: split must be 'train' or 'test', got {self.split!r}")
+        kinds: dict[str, Callable[[Any], Any]] = {"time": float, "zoom": float, "index": index}
+        for name, kind in kinds.items():
+            if getattr(self, name) is not None or name == "zoom":
+                object.__setattr__(self, name, self._number(name, kind))
+        if not math.isfinite(self.time or 0) or not 0 < self.zoom < math.inf:
+            raise SettingsError(f"camera {self.name!r}: time must be finite, and zoom a number above 0, got {self.time} and {self.zoom}")
 
     def _check_intrinsics(self) -> None:
         """Turn the intrinsics into numbers of Python. Raises SettingsError."""
@@ -98,13 +141,7 @@ class Camera:
 
     def _pose(self) -> Tensor:
         """A copy of the pose, which its owner cannot change any more. Raises ShapeError, SettingsError."""
-        given = self.viewmat.detach() if isinstance(self.viewmat, Tensor) else self.viewmat
-        try:
-            pose = torch.as_tensor(given, dtype=torch.float64, device="cpu").clone()
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise ShapeError(f"viewmat: expected a tensor or an array of shape [4, 4], got {type(given).__name__}") from error
-        if tuple(pose.shape) != (4, 4):
-            raise ShapeError(f"viewmat: expected shape [4, 4], got {list(pose.shape)}")
+        pose = _matrix("viewmat", self.viewmat, (4, 4))
         *rows, last = pose.tolist()  # numbers of Python: operations on tensors so small take several times as long
         if not all(map(math.isfinite, (number for row in (*rows, last) for number in row))):
             raise SettingsError(f"camera {self.name!r}: the pose contains NaN or infinity")
@@ -197,6 +234,19 @@ class Camera:
         return replace(self, viewmat=viewmat, name=name)
 
 
+def _matrix(name: str, given: Any, shape: tuple[int, int]) -> Tensor:
+    """A copy of a tensor or an array as float64 on the CPU. Raises ShapeError."""
+    given = given.detach() if isinstance(given, Tensor) else given
+    try:
+        matrix = torch.as_tensor(given, dtype=torch.float64, device="cpu").clone()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ShapeError(f"{name}: expected a tensor or an array of shape {list(shape)}, got {type(given).__name__}") from error
+    if tuple(matrix.shape) != shape:
+        several = "; make a camera of each" if matrix.dim() > 2 else ""
+        raise ShapeError(f"{name}: expected shape {list(shape)}, got {list(matrix.shape)}{several}")
+    return matrix
+
+
 # A camera of one pixel, for what does not depend on it.
 ONE_PIXEL = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
 
@@ -223,7 +273,8 @@ def checked(cameras: Any, *, some: bool = False) -> list[Camera]:
     """Cameras as a list, of at least one if there have to be `some`. Raises SettingsError for anything else."""
     found = list(cameras) if isinstance(cameras, Iterable) and not isinstance(cameras, (str, bytes)) else [cameras]
     if wrong := [each for each in found if not isinstance(each, Camera)]:
-        advice = "those of a file are load_scene(path).cameras" if isinstance(wrong[0], (str, Path)) else "give a sequence of them"
+        of_a_file = isinstance(wrong[0], (str, Path))
+        advice = "those of a file are load_scene(path).cameras" if of_a_file else "Camera.of_matrices and Camera.of_opengl make them of arrays"
         raise SettingsError(f"cameras must be of the type mipmap_plugin.Camera, got {type(wrong[0]).__name__}; {advice}")
     if some and not found:
         raise SettingsError("cameras: there are none in what was given; leave it out for those of the checkpoint or, without any, an orbit")

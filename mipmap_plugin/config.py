@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -93,6 +94,13 @@ class AdaptConfig(BaseModel):
     densify_on_trial: bool = Field(False, description="Undo growth that leaves views farther from the base than at the start.")
     most_growth: float | None = Field(None, ge=1, description="Maximum ratio of splats after densifying to splats before; None: unlimited.")
     reset_opacity_at: int | None = Field(None, ge=0, description="Step before which all opacities are cut to 0.01, on a white background only.")
+
+    @field_validator("upsampler", mode="before")
+    @classmethod
+    def _upsampler_is_named(cls, upsampler: Any) -> Any:
+        if callable(upsampler):
+            raise ValueError("must be the name of an upsampler, which register_upsampler gives to a function")
+        return str(upsampler) if isinstance(upsampler, Path) else upsampler
 
     @field_validator("band")
     @classmethod

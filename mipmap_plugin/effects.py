@@ -94,6 +94,13 @@ MODEL_EFFECTS = (
 )
 
 
+def as_outputs(names: Sequence[str] | None) -> tuple[str, ...]:
+    """What is rendered besides the image, as `Effects.outputs`. Raises SettingsError for a text, which is a sequence too."""
+    if isinstance(names, str):
+        raise SettingsError(f"outputs must be a sequence of names, such as [{names!r}], got {names!r}")
+    return tuple(names or ())
+
+
 def explain(
     effects: Effects, gaussians: Gaussians, reported: Sequence[Effect] = (), config: AdaptConfig | None = None, scale: float = 1.0
 ) -> tuple[Effect, ...]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, SupportsIndex, TypedDict, cast
 import torch
 
 from mipmap_plugin.adaptation import notebook
-from mipmap_plugin.adaptation.adapted import Adapted, render_model
+from mipmap_plugin.adaptation.adapted import Adapted, as_start, render_model
 from mipmap_plugin.adaptation.choosing import choose, mergeable_settings
 from mipmap_plugin.adaptation.conversion import Stages, conversion
 from mipmap_plugin.adaptation.session import AdaptationRequest, Observer
@@ -25,12 +25,12 @@ from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
 from mipmap_plugin.camera import ONE_PIXEL, Camera, checked, digest_of, of_base_scale
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.effects import Effects
+from mipmap_plugin.effects import Effects, as_outputs
 from mipmap_plugin.errors import BackendUnavailable, SettingsError
 from mipmap_plugin.formats.atomic import named, refuse_output, refuse_unwritable
 from mipmap_plugin.formats.splat_transform import refuse_unread
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.limits import check_image, check_kinds, check_names, check_scale
+from mipmap_plugin.limits import check_image, check_kinds, check_names, check_scale, path_of
 from mipmap_plugin.models.base import Filtered, SplatModel, TrainedScale, checked_splats, why_no_viewer
 from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
 from mipmap_plugin.models.outputs import parts_of
@@ -131,16 +131,14 @@ class FrozenBase:
         `screen_filter`: as in `effects`. `supersampling`: samples per pixel along each axis. `options`: see `RenderOptions`. Raises
         SettingsError.
         """
-        [camera], outputs = checked([camera]), options.get("outputs") or ()
-        if isinstance(outputs, str):
-            raise SettingsError(f"outputs must be a sequence of names, such as [{outputs!r}], got {outputs!r}")
-        check_names("render", options, RenderOptions)
+        [camera], outputs = checked([camera]), as_outputs(options.get("outputs"))
+        check_names("render", options, RenderOptions, ("scale", "screen_filter", "supersampling"))
         viewer, exposure = options.get("viewer"), options.get("exposure", False)
         scale = check_scale(scale)
         if not isinstance(supersampling, SupportsIndex) or supersampling < 1:
             raise SettingsError(f"supersampling: must be at least 1 sample per pixel along each axis, got {supersampling!r}")
         check_image(camera.width * supersampling, camera.height * supersampling, self.model.parameters()["means"].device)
-        effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=tuple(outputs), exposure=exposure)
+        effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=outputs, exposure=exposure)
         backend, _ = self.backend(screen_filter=screen_filter, viewer=viewer)
         form = self._smoothed if options.get("filter_3d") else None
         with threads.limited(self.threads, shared=False) if self.threads is not None else nullcontext():
@@ -166,7 +164,7 @@ class FrozenBase:
         resume: str | Path | None = None,
         observe: Observer | None = None,
         images: Scene | None = None,
-        start: FinerLevel | None = None,
+        start: FinerLevel | Adapted | None = None,
         **settings: Any,
     ) -> Adapted:
         """Return a new model for `scale` (target focal length in px over base focal length in px); the base does not change.
@@ -179,17 +177,19 @@ class FrozenBase:
         called before the first step and after each (of the conversion before a zoom-in, too: `adaptation.conversion`); `render(camera)` is
         the current image [H, W, 3], without gradients, and the run ends where it returns True.
         `images`: a scene whose training images are the truth of a zoom-in, instead of the base's renders of these views.
-        `start`: a model for the same viewer at a finer scale, to start from instead of from the base. While it runs, torch's default dtype is
+        `start`: a model adapted for the same viewer to a finer scale, to start from instead of from the base. While it runs, torch's default dtype is
         float32, and torch may have one thread, in the whole process: torch has one of each. Raises SettingsError and BackendUnavailable.
         """
         scale, cameras = check_scale(scale), None if cameras is None else of_base_scale(cameras, some=True)
-        check_kinds(images=(images, Scene), start=(start, FinerLevel), resume=(resume, str | Path), observe=(observe, Callable))
+        finer: FinerLevel | None = as_start(start, viewer)
+        check_kinds(images=(images, Scene), start=(finer, FinerLevel), observe=(observe, Callable))
+        state = None if resume is None else path_of(resume, "resume")
         model = self._fused if viewer is not None and self.model.traits.filtered else self.model
         settings = mergeable_settings(model, settings)
         if images is not None and self.model.traits.exposures.changed:
             raise SettingsError("the images were exposed differently, which adaptation does not support (exposure.json); leave them out")
         config, targets = self._planned(recipe, scale, viewer, settings)
-        first = conversion(config, self.effects(), targets.values(), scale) if start is None else None
+        first = conversion(config, self.effects(), targets.values(), scale) if finer is None else None
         views = {} if cameras is None else {"views": digest_of(cameras)}
         inputs = self.asked | views | ({} if images is None else {"photographs": images.digest()})
         photographs = None if images is None else Photographs(self.place(images), self.cameras, self.background)
@@ -199,15 +199,15 @@ class FrozenBase:
         backend, note, has_gradients = choose(self._backend, config, needs, self._needs)
         if config.steps:
             self._refuse_large(cameras or self.views(), scale)
-        if start is not None and start.scale <= scale:
-            raise SettingsError(f"start: x{start.scale:g} is not finer than x{scale:g}; leave it out")
+        if finer is not None and finer.scale <= scale:
+            raise SettingsError(f"start: x{finer.scale:g} is not finer than x{scale:g}; leave it out")
         base_in_viewer = model if (in_viewer := self.read_by(viewer)) is self.model else in_viewer
         base_images = self._base_images(model, backend, self.keeps_images or first is not None)
-        request = AdaptationRequest(base_images, targets, viewer, note, has_gradients, base_in_viewer, start, inputs, self.trained.up)
+        request = AdaptationRequest(base_images, targets, viewer, note, has_gradients, base_in_viewer, finer, inputs, self.trained.up)
         family, theirs = f"family {model.family!r}", {f"backend {backend.name!r}": getattr(backend, "theirs", backend)}
         alone = threads.limited_for(backend, self.threads)
         with alone, torch.enable_grad(), naming_any({family: model, **theirs}), unchanged(family, model.parameters()):
-            stages = Stages(request, list(cameras), photographs, None if resume is None else Path(resume), observe)
+            stages = Stages(request, list(cameras), photographs, state, observe)
             adapted = stages.adapt(scale, config, first)
         adapted.report.seconds["loading"] = self.loading_s
         adapted.report.cameras_from.update(self.cameras_from)

@@ -33,13 +33,16 @@ class Gaussians:
     covariances: Tensor | None = None
 
     def __post_init__(self) -> None:
-        n = self.means.shape[0]
+        given = {field.name: getattr(self, field.name) for field in fields(self)}
+        if wrong := [name for name, tensor in given.items() if not isinstance(tensor, Tensor) and (tensor is not None or name != "covariances")]:
+            raise ShapeError(f"{wrong[0]}: expected a torch tensor, got {type(given[wrong[0]]).__name__}")
+        n = self.means.shape[0] if self.means.dim() else 0
         bands = math.isqrt(self.sh.shape[1]) if self.sh.dim() == 3 else 0
         expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, max(bands, 1) ** 2, 3)}
         if self.covariances is not None:
             expected["covariances"] = (n, 3, 3)
         for name, shape in expected.items():
-            tensor = getattr(self, name)
+            tensor = given[name]
             if tuple(tensor.shape) != shape:
                 raise ShapeError(f"{name}: expected shape {list(shape)}, got {list(tensor.shape)}")
             if (tensor.device, tensor.dtype) != (self.means.device, self.means.dtype):

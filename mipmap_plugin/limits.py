@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.errors import SettingsError
@@ -31,21 +32,39 @@ def check_scale(scale: Any) -> float:
         number = math.nan
     if not MIN_SCALE <= number <= MAX_SCALE:  # also for NaN
         got = f"{scale:g}" if isinstance(scale, float) else repr(scale)[:40]
-        raise SettingsError(f"scale must be from {MIN_SCALE:g} to {MAX_SCALE:g}, such as 0.25 or 4, got {got}")
+        several = "; give one at a time" if isinstance(scale, (list, tuple)) else ""
+        raise SettingsError(f"scale must be from {MIN_SCALE:g} to {MAX_SCALE:g}, a number such as 0.25 or 4, got {got}{several}")
     return number
+
+
+def path_of(path: Any, name: str = "path") -> Path:
+    """Return what was given as a path, "~" as the home folder. Raises SettingsError for anything else than a path, and for an empty one."""
+    if not isinstance(path, (str, Path)) or path == "":
+        got = "an empty text" if path == "" else type(path).__name__
+        raise SettingsError(f"{name} must be a text such as 'output/bicycle', or a pathlib.Path, got {got}")
+    try:
+        return Path(path).expanduser()
+    except RuntimeError as error:
+        raise SettingsError(f"{path}: there is no home folder of that name; write the path in full") from error
 
 
 def check_kinds(**given: tuple[Any, Any]) -> None:
     """Raise SettingsError for arguments, by name, that are neither None nor of the kind that each has to be."""
     for name, (value, kind) in given.items():
         if value is not None and not isinstance(value, kind):
-            raise SettingsError(f"{name} must be a {getattr(kind, '__name__', kind)}, got {type(value).__name__}")
+            wanted = getattr(kind, "__name__", kind)
+            hint = "; load_scene(path) reads one" if wanted == "Scene" else ""
+            raise SettingsError(f"{name} must be a {wanted}, got {type(value).__name__}{hint}")
 
 
-def check_names(function: str, options: Mapping[str, Any], kind: type) -> None:
-    """Raise TypeError for options that are not among those of `kind`, a TypedDict, as Python does for arguments that a function lacks."""
+def check_names(function: str, options: Mapping[str, Any], kind: type, beside: Sequence[str]) -> None:
+    """Raise TypeError for options that are not among those of `kind`, a TypedDict, as Python does for arguments that a function lacks.
+
+    `beside`: the arguments that it has beside them.
+    """
     if unknown := options.keys() - kind.__annotations__.keys():
-        raise TypeError(f"{function}() got unknown options: {', '.join(sorted(unknown))}; there are {', '.join(kind.__annotations__)}")
+        known = ", ".join((*beside, *kind.__annotations__))
+        raise TypeError(f"{function}() got unknown options: {', '.join(sorted(unknown))}; there are {known}")
 
 
 def derived_seed(seed: int, number: int) -> int:

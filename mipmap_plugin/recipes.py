@@ -42,6 +42,12 @@ MOST_DRAWS = 1.8e8
 # photographs of chair they lose 0.6 dB against the closed form at x1.02, 0.2 dB at x1.05, nothing at x1.1, and from there on they gain.
 LEAST_ZOOM_IN = 1.1
 
+# What is said of a base when it is wrapped, and not of each adaptation.
+OF_THE_BASE = ("backend", "threads", "background", "screen_filter", "up")
+
+# Characters of a wrong value that a message quotes; of a longer one, such as a list of cameras, it names the type.
+LONGEST = 80
+
 # What a run ends by at the user's wish: then `most_draws` does not, and there are steps at any zoom.
 ENDS = ("steps", "time_budget_s", "target_db")
 
@@ -113,8 +119,6 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
     Raises SettingsError for an unknown name or a value out of range, PluginError for a third-party recipe that fails.
     """
     scale = check_scale(scale)
-    if name not in RECIPES.names():
-        raise SettingsError(f"there is no recipe {name!r}; choose from {', '.join(RECIPES.names())}")
     function = RECIPES.get(name)
     if not callable(function):
         raise PluginError(f"recipe {name!r} is of type {type(function).__name__}; make it a function (scale, network) -> settings")
@@ -151,10 +155,13 @@ def _told(error: Any, given: Mapping[str, Any]) -> str:
     if within and name == "rates" and error["type"] != "invalid_key":
         name, got, known = f"rates.{within[0]}", error["input"], LearningRates.model_fields
     if error["type"] == "extra_forbidden":
+        if name in OF_THE_BASE:
+            return f"{name} is no setting of an adaptation; give it to wrap_model"
         meant = get_close_matches(str(error["loc"][-1]), known, 1)
         return f"there is no setting {name}; {f'did you mean {meant[0]}? ' if meant else ''}mipmap_plugin.config has all of them"
     own = str(error["ctx"]["error"]) if error["type"] == "value_error" else f"must be {allowed(name)}"
-    return f"setting {name}: {own}, got {got!r}"
+    said = repr(got)
+    return f"setting {name}: {own}, got {said if len(said) <= LONGEST else f'a {type(got).__name__}'}"
 
 
 def scale_of_fraction(kept: float) -> float:

@@ -49,10 +49,12 @@ class Registry:
 
     def get(self, name: str) -> Any:
         """Return the object of that name. Raises SettingsError for an unknown name, PluginError for a broken target."""
-        if not isinstance(name, str) or (name not in self._targets and name not in self._installed()):
-            meant = difflib.get_close_matches(str(name).lower(), self.names(), 1)
+        kind = self.group.rpartition(".")[2].removesuffix("s")
+        if not isinstance(name, str):  # most often the plug-in itself
+            raise SettingsError(f"a {kind} is given by its name, got {type(name).__name__}; register your own first, by register_{kind}(name, ...)")
+        if name not in self._targets and name not in self._installed():
+            meant = difflib.get_close_matches(name.lower(), self.names(), 1)
             guess = f"; did you mean {meant[0]}?" if meant else ""
-            kind = self.group.rpartition(".")[2].removesuffix("s")
             raise SettingsError(f"there is no {kind} {name!r}; choose from {', '.join(self.names())}{guess}")
         target = self._targets[name] if name in self._targets else self._installed()[name]
         return load_target(name, target) if isinstance(target, str) else target

@@ -15,7 +15,7 @@ from mipmap_plugin.adaptation.adapted import Adapted as Adapted
 from mipmap_plugin.adaptation.cameras_of_base import own_cameras, where
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
 from mipmap_plugin.adaptation.target.photographs import placed
-from mipmap_plugin.backends import device_for
+from mipmap_plugin.backends import BACKENDS, device_for
 from mipmap_plugin.camera import Camera, digest_of, of_base_scale
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.frozen_base import FrozenBase
@@ -26,8 +26,9 @@ from mipmap_plugin.models.adapted_scale import known_up
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
+from mipmap_plugin.process.threads import checked as checked_threads
 from mipmap_plugin.process.torch_modes import usual_modes
-from mipmap_plugin.scenes import Scene
+from mipmap_plugin.scenes import Scene, load_scene
 from mipmap_plugin.scenes.trajectories import AXES
 from mipmap_plugin.screen_filters import USUAL_EPS2D
 
@@ -61,7 +62,7 @@ class Wrapped(FrozenBase):
 def wrap_model(
     model: SplatModel | str | Path | Any,
     *,
-    cameras: Sequence[Camera] | Scene | None = None,
+    cameras: Sequence[Camera] | Scene | str | Path | None = None,
     backend: str = "auto",
     threads: int | None = None,
     **options: Unpack[WrapOptions],
@@ -70,7 +71,7 @@ def wrap_model(
 
     A checkpoint is loaded to the GPU if a backend serves it there (`backends.device_for`); a model stays on its device.
 
-    `cameras`: views of the scale of its training, or the scene that it was trained on; by default those beside the checkpoint, or
+    `cameras`: views of the scale of its training, or the scene that it was trained on or its path; by default those beside the checkpoint, or
     those of the base of an adapted file.
     `threads`: to adapt with; by default as many as torch has. With the backend cpu the result does not depend on it.
     `options`: `background`, linear RGB, by default that of the checkpoint, or else black; `screen_filter`, that it was trained with, if its
@@ -78,7 +79,8 @@ def wrap_model(
     are generated, as there are no cameras, then look from above the horizon. Raises CheckpointError, SceneError, and SettingsError for an
     unknown filter or axis, or an object that is not a model.
     """
-    check_names("wrap_model", options, WrapOptions)
+    check_names("wrap_model", options, WrapOptions, ("cameras", "backend", "threads"))
+    check_serves(backend, threads)
     background, screen_filter, up = options.get("background"), options.get("screen_filter"), options.get("up")
     color = None if background is None else check_background(background)
     began = time.perf_counter()
@@ -106,8 +108,18 @@ def axis_of(up: str) -> tuple[float, float, float]:
     return AXES[up]
 
 
-def _found(model: SplatModel, cameras: Sequence[Camera] | Scene | None) -> tuple[Sequence[Camera] | Scene, dict[str, str]]:
+def check_serves(backend: str, threads: int | None) -> None:
+    """Raise SettingsError for a backend that does not exist, and for no number of threads, before anything is loaded."""
+    if backend != "auto":
+        BACKENDS.get(backend)
+    if threads is not None:
+        checked_threads(threads)
+
+
+def _found(model: SplatModel, cameras: Sequence[Camera] | Scene | str | Path | None) -> tuple[Sequence[Camera] | Scene, dict[str, str]]:
     """The cameras that are given, those beside the model's file, or, of an adapted file, those of its base; and `where` they were read from."""
+    if isinstance(cameras, (str, Path)):
+        cameras = load_scene(cameras, read_options(model.folder)[0])
     if isinstance(cameras, Scene):
         return cameras, where(cameras.source, model.folder)
     if cameras is not None:

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -121,7 +122,50 @@ def test_numbers_of_other_libraries_become_those_of_python():
     assert view.viewmat.dtype == torch.float64
 
 
+def test_what_is_said_of_a_view_becomes_text_and_numbers_of_python(camera):
+    view = replace(camera, name=Path("a/b.png"), time=np.float32(0.5), zoom=torch.tensor(2.0), index=np.int64(3))
+    assert (view.name, view.time, view.zoom, view.index) == ("a/b.png", 0.5, 2.0, 3)
+    assert [type(value) for value in (view.time, view.zoom, view.index)] == [float, float, int]
+
+
+K = np.array([[70.0, 0, 32], [0, 72, 24], [0, 0, 1]])
+
+
+def test_cameras_of_matrices_are_those_of_their_numbers(camera):
+    view = Camera.of_matrices(VIEWMAT.float(), torch.tensor(K), 64, 48, name="view", split="test", time=0.5)
+    assert replace(view, viewmat=VIEWMAT).viewmat.equal(camera.viewmat) and torch.allclose(view.viewmat, VIEWMAT)
+    assert (view.fx, view.fy, view.cx, view.cy, view.size, view.name, view.time) == (70, 72, 32, 24, (48, 64), "view", 0.5)
+
+
+@pytest.mark.parametrize("rows", [3, 4])
+def test_poses_of_opengl_look_at_the_same(camera, rows):
+    """A camera of NeRF at the eye, whose y is up and whose z is backward, shows a point where the camera itself does."""
+    c2w = torch.linalg.inv(VIEWMAT)
+    c2w[:3, 1:3] *= -1
+    view = Camera.of_opengl(c2w[:rows].tolist(), K, 64, 48)
+    assert project(view, (0.2, -0.3, 0.5)) == pytest.approx(project(camera, (0.2, -0.3, 0.5)))
+
+
+@pytest.mark.parametrize(("make", "sentence"), [
+    (lambda: Camera.of_matrices(VIEWMAT[None], K, 64, 48), r"viewmat: expected shape \[4, 4\], got \[1, 4, 4\]; make a camera of each"),
+    (lambda: Camera.of_matrices(VIEWMAT, np.eye(4), 64, 48), r"K: expected shape \[3, 3\], got \[4, 4\]"),
+    (lambda: Camera.of_matrices(VIEWMAT, K + np.eye(3, k=1), 64, 48), "K: a pinhole has no skew, got 1"),
+    (lambda: Camera.of_opengl(None, K, 64, 48), "c2w: expected a tensor or an array"),
+    (lambda: Camera.of_opengl(np.zeros((4, 4)), K, 64, 48), "c2w: the pose .* cannot be inverted"),
+])  # fmt: skip
+def test_matrices_of_no_camera_are_named(make, sentence):
+    with pytest.raises((SettingsError, ShapeError), match=sentence):
+        make()
+
+
 @pytest.mark.parametrize(("change", "sentence"), [
+    (dict(time="x"), "time must be a number, got 'x'"),
+    (dict(time=math.nan), "time must be finite"),
+    (dict(zoom=None), "zoom must be a number, got None"),
+    (dict(zoom=0), "zoom a number above 0"),
+    (dict(index=0.5), "index must be a whole number, got 0.5"),
+    (dict(split="val"), "split must be 'train' or 'test', got 'val'"),
+    (dict(name=3), "name must be a text, got 3"),
     (dict(width=8.5), "width must be a whole number, got 8.5"),
     (dict(fx="9"), "fx must be a number, got '9'"),
     (dict(cy=None), "cy must be a number"),

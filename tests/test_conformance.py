@@ -218,6 +218,14 @@ def test_a_long_message_does_not_widen_the_lines_of_others():
     assert len(lines[-1]) > 500 and max(map(len, lines[:-1])) < 100
 
 
+def test_the_table_ends_with_what_failed_after_the_reasons_why_others_were_not_run():
+    wrong = Outcome("wrong", 0.5, True, False, "differs")
+    skipped = [Outcome(f"no {i}", 0, True, True, "no SH; no colors", skipped=True) for i in (1, 2)]
+    first, second, *_, right, failed = tables.check_table([wrong, *skipped, Outcome("right", 0, True, True, "")]).splitlines()
+    assert "| right " in right and "FAIL: differs" in failed
+    assert [first, second] == ["skipped, 2 times: no SH", "skipped, 2 times: no colors"]
+
+
 def test_the_summary_counts_what_was_run():
     assert summary(check_backend(WithoutGradients(), FEW)) == "5 cases: 4 run, 1 skipped, 0 failed"
     assert summary(check_backend(Raises(), FEW)) == "5 cases: 5 run, 0 skipped, 1 failed"

@@ -1,6 +1,7 @@
 """Live objects of other projects: copied by their attributes, never changed, adapted like a file."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import anchor_checkpoints as checkpoints
 import numpy as np
@@ -120,6 +121,9 @@ class Anchors:
         (Mip(), "has a 3D filter .* give the path"),
         (Anchors(), "has anchors with networks .* give the path"),
         ({**splats(), "features": torch.zeros(30, 32)}, "a dict with means, .*is not a known kind of model"),
+        ({name: tensor for name, tensor in splats().items() if name != "shN"}, r"shN is empty, \[N, 0, 3\]\), and this one lacks shN$"),
+        ({**splats(), "features": torch.zeros(30, 32)}, r"and this one has features besides$"),
+        (wrap_model(splats()), "a Wrapped is not a known kind of model; give its attribute `model`$"),
         (7, "a int is not a known kind of model; give a path"),
     ],
 )
@@ -154,6 +158,12 @@ def test_splats_in_other_hands_are_those_of_gsplat(thing):
         for tensor in adopted.parameters().values():
             tensor.zero_()
     assert adopt(held).parameters()["means"].abs().sum() > 0
+
+
+def test_nerfstudio_s_pipeline_and_trainer_hold_its_model():
+    pipeline = SimpleNamespace(model=live_objects(raw := splats())["splatfacto"])
+    for each in (pipeline, SimpleNamespace(pipeline=pipeline)):
+        assert torch.equal(adopt(each).parameters()["means"], raw["means"])
 
 
 def test_gaussians_are_taken_as_splats_of_3dgs():

@@ -179,5 +179,5 @@ def test_what_is_no_axis_is_refused(files, up):
 
 
 def test_an_unknown_option_is_refused(files):
-    with pytest.raises(TypeError, match=r"^wrap_model\(\) got unknown options: upwards; there are background, screen_filter, up$"):
+    with pytest.raises(TypeError, match=r"\) got unknown options: upwards; there are cameras, backend, threads, background, screen_filter, up$"):
         wrap_model(files[0], upwards="z")

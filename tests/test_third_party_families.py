@@ -12,8 +12,9 @@ import torch
 
 from mipmap_plugin import load_model, register_model, wrap_model
 from mipmap_plugin.cli import main
+from mipmap_plugin.effects import MODEL_EFFECTS, Effect
 from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
-from mipmap_plugin.models import API_VERSION, CERTAIN, PLAIN, Family, Match, contract, detect
+from mipmap_plugin.models import API_VERSION, CERTAIN, PLAIN, Family, Match, Traits, contract, detect
 from mipmap_plugin.models.adapted_name import adapted_name
 from mipmap_plugin.models.conformance import ModelSuite
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family
@@ -73,6 +74,24 @@ def test_an_adapted_file_keeps_the_suffix_by_which_its_family_knows_it(tmp_path,
     assert len(load_model(tmp_path / name).parameters()["means"])
 
 
+def test_an_archive_of_numpy_s_own_numbers_is_drawn_by_the_fast_backends(tmp_path):
+    register_model("npz", EXAMPLE["FAMILY"])
+    np.savez(tmp_path / "scene.npz", **{name: tensor.double().numpy() for name, tensor in tiny.model(40).parameters().items()})
+    assert {tensor.dtype for tensor in load_model(tmp_path / "scene.npz").parameters().values()} == {torch.float32}
+
+
+def test_a_family_that_loads_float64_is_told_what_draws_it(tmp_path):
+    class Doubles(VanillaModel):
+        family = "mine"
+
+    def doubles(path, iteration):
+        return Doubles.from_gaussians(tiny.gaussians(8).to(dtype=torch.float64))
+
+    register_model("mine", custom_family(load=doubles))
+    [note] = load_model(ply(tmp_path / "a.ply", "mine")).notes
+    assert note == "family 'mine' loads float64, which only the slow backend reference draws; its load should return float32"
+
+
 def test_a_numpy_archive_that_nobody_claims_is_told_to_be_one(tmp_path):
     with pytest.raises(CheckpointError, match=r"scene\.npz is a NumPy archive that no family knows; .* or register its family$"):
         detect(archive(tmp_path / "scene.npz"))
@@ -103,6 +122,17 @@ def test_a_model_is_not_saved_under_a_name_that_its_family_does_not_know(tmp_pat
     base = wrap_model(model, cameras=tiny.cameras())
     with pytest.raises(PluginError, match="no family recognizes"):
         ModelSuite().test_a_name_without_an_ending_is_refused_or_read_again(base, tmp_path)
+
+
+@pytest.mark.parametrize(("traits", "on"), [
+    (Traits(), ["view-dependent geometry"]), (Traits(moves=True), ["time"]), (Traits(same_for_all_views=True), []),
+    (Traits(effects=(Effect("levels of detail", True, "it has some", "a comparison"),)), ["levels of detail"]),
+])  # fmt: skip
+def test_what_a_family_does_not_report_follows_from_its_other_traits(traits, on):
+    model = tiny.model(10)
+    model.traits = traits
+    effects = wrap_model(model, cameras=tiny.cameras(), backend="reference").render(tiny.cameras()[0]).effects
+    assert [effect.name for effect in effects if effect.on and effect.name in {each.name for each in MODEL_EFFECTS}] == on
 
 
 def test_a_file_for_a_viewer_is_a_ply(tmp_path):

@@ -14,16 +14,17 @@ from mipmap_plugin.adaptation import notebook
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, Validation
 from mipmap_plugin.adaptation.report import Report
+from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends import supersample
 from mipmap_plugin.backends.base import Backend, Rendered
-from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import Effects, explain
+from mipmap_plugin.camera import Camera, checked
+from mipmap_plugin.effects import Effects, as_outputs, explain
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, staged, together, write_json
 from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.limits import check_image
+from mipmap_plugin.limits import check_image, path_of
 from mipmap_plugin.models import contract, load_model
 from mipmap_plugin.models.base import SplatModel, checked_splats, effects_of
 from mipmap_plugin.models.exposure import exposed
@@ -64,14 +65,16 @@ class Adapted:
     written: dict[Path, float] = field(default_factory=dict)
 
     @usual_modes()
-    def render(self, camera: Camera, *, outputs: Sequence[str] = (), exposure: bool = False, viewer: str | None = None) -> Rendered:
+    def render(self, camera: Camera, *, outputs: Sequence[str] | None = (), exposure: bool = False, viewer: str | None = None) -> Rendered:
         """Render the view of a camera of the new scale, in one of the `viewers`; `outputs` and `exposure` as in `Wrapped.render`."""
+        [camera] = checked([camera])
+        outputs = as_outputs(outputs)
         if viewer is not None and viewer not in self.viewers:
             available = ", ".join(filter(None, self.viewers)) or "no viewer by name"
             raise SettingsError(f"this model was not made for the viewer {viewer!r}, but for {available}")
         effects = self.effects if viewer is None else self.viewers[viewer]
         check_image(camera.width, camera.height, self.model.parameters()["means"].device)
-        return render_model(self.model, self.backend, camera, replace(effects, outputs=tuple(outputs), exposure=exposure))
+        return render_model(self.model, self.backend, camera, replace(effects, outputs=outputs, exposure=exposure))
 
     def views(self) -> list[Camera]:
         """The base's cameras at the scale of this model, for `render`."""
@@ -92,10 +95,11 @@ class Adapted:
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""
-        refuse_output(Path(path), overwrite, parts_of(self.model.source, self.model.folder))  # whatever the family itself looks at
-        with together(Path(path)), naming_any({f"family {self.model.family!r}": self.model}):  # a new model never appears without its report
-            model = for_loader_of(self.report.viewer, self.model, Path(path))
-            saved = contract.save(model, Path(path), self.report.provenance(), overwrite=overwrite)
+        path = path_of(path)
+        refuse_output(path, overwrite, parts_of(self.model.source, self.model.folder))  # whatever the family itself looks at
+        with together(path), naming_any({f"family {self.model.family!r}": self.model}):  # a new model never appears without its report
+            model = for_loader_of(self.report.viewer, self.model, path)
+            saved = contract.save(model, path, self.report.provenance(), overwrite=overwrite)
             self._judge(saved)
             write_json(saved.with_name(saved.name + REPORT), self.report_of(saved).model_dump(), overwrite=overwrite)
         for state in self.states:
@@ -138,6 +142,16 @@ class Adapted:
 
     def _drawn_otherwise(self, path: Path) -> str:
         return "" if self.report.viewer else drawn_otherwise(path, self.model.trained)
+
+
+def as_start(start: Any, viewer: str | None) -> Any:
+    """What an adaptation for `viewer` starts from: of an adapted model, its splats. Raises SettingsError if that was made for another viewer."""
+    if not isinstance(start, Adapted):
+        return start
+    if start.report.viewer != viewer:
+        made, wanted = (name or "what draws as the training did" for name in (start.report.viewer, viewer))
+        raise SettingsError(f"start: it is made for {made}, and not for {wanted}; leave it out, or give the same viewer")
+    return FinerLevel(start.model, start.report.scale, f"the model adapted to x{start.report.scale:g}")
 
 
 @torch.no_grad()

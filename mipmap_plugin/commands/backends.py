@@ -8,6 +8,9 @@ from mipmap_plugin.commands.common import print_facts
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 
+# Failed cases that the last line names; the table has all of them at its end.
+NAMED = 5
+
 
 def backends(check: str | None = None, full: bool = False, json: bool = False) -> None:
     """List the backends and why each can or cannot adapt on this machine, or check one against the reference.
@@ -31,7 +34,8 @@ def backends(check: str | None = None, full: bool = False, json: bool = False) -
     say(f"{tables.check_table(outcomes)}\n{summary(outcomes)}") if not json else print_facts([asdict(row) for row in outcomes], json)
     failed = [row.case for row in outcomes if not row.passed]
     if failed:
-        raise SettingsError(f"backend {check!r} fails {len(failed)} of {len(outcomes)} cases: {', '.join(failed[:5])}")
+        more = f" and {len(failed) - NAMED} more" if len(failed) > NAMED else ""
+        raise SettingsError(f"backend {check!r} fails {len(failed)} of {len(outcomes)} cases: {', '.join(failed[:NAMED])}{more}")
     skipped = [row.message for row in outcomes if row.skipped]
     if len(outcomes) - len(skipped) < LEAST_RUN * len(outcomes):
         few = f"{len(outcomes) - len(skipped)} of {len(outcomes)} cases"

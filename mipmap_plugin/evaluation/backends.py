@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +16,9 @@ from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.conformance import CASES, MORE, Outcome, check_backend
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.evaluation.report import markdown
+
+# Reasons that are told beside the table of cases: the most frequent.
+REASONS = 5
 
 
 @dataclass(frozen=True)
@@ -71,10 +75,10 @@ def _devices() -> list[str]:
 
 
 def check_table(rows: Sequence[Outcome]) -> str:
-    """A Markdown table of the outcomes of a conformance suite."""
-
-    def result(row: Outcome) -> str:
-        return "skipped: " + row.message if row.skipped else "pass" if row.passed else "FAIL: " + row.message
-
-    body = [[row.case, f"{row.max_error:.1e}", "yes" if row.finite else "NO", result(row)] for row in rows]
-    return markdown(["case", "max error", "finite", "result"], body)
+    """How often each reason kept cases from being run, and a Markdown table of those that were, at its end those that failed."""
+    ran = sorted((row for row in rows if not row.skipped), key=lambda row: not row.passed)
+    body = [[row.case, f"{row.max_error:.1e}", "yes" if row.finite else "NO", "pass" if row.passed else f"FAIL: {row.message}"] for row in ran]
+    reasons = Counter(reason for row in rows if row.skipped for reason in row.message.split("; "))
+    skipped = [f"skipped, {count} times: {reason}" for reason, count in reasons.most_common(REASONS)]
+    skipped += [f"skipped for {len(reasons) - REASONS} more reasons (--json has all)"] * (len(reasons) > REASONS)
+    return "\n".join([*skipped, markdown(["case", "max error", "finite", "result"], body)])

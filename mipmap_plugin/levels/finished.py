@@ -11,15 +11,19 @@ from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.levels.contents import Contents, Level
 from mipmap_plugin.levels.distance.manifest import Contents as DistanceContents
 from mipmap_plugin.levels.store import LevelStore
+from mipmap_plugin.limits import path_of
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Ladder:
     """A ladder in memory, whichever way its levels were made."""
 
     contents: Contents | DistanceContents
     _store: LevelStore
     _write: Callable[[Any, Path, bool], Path]  # contents, folder, whether to overwrite
+
+    def __repr__(self) -> str:
+        return f"<Ladder: {len(self.levels)} levels>"
 
     @property
     def levels(self) -> list[Level] | list[Adapted]:
@@ -31,7 +35,7 @@ class Ladder:
 
         `keep_resume`: leave what was kept to go on from until `forget`.
         """
-        saved = self._write(self.contents, Path(folder), overwrite)
+        saved = self._write(self.contents, path_of(folder), overwrite)
         if not keep_resume:
             self.forget()
         return saved

@@ -23,6 +23,7 @@ from mipmap_plugin.levels.request import FINEST_RATIO, SAME, Band, LadderRequest
 from mipmap_plugin.levels.store import LevelStore
 from mipmap_plugin.levels.switching import switching_zoom, zooms_between
 from mipmap_plugin.levels.yardstick import Yardstick
+from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.base import why_no_viewer
 from mipmap_plugin.process import threads
 from mipmap_plugin.progress import announced
@@ -53,7 +54,7 @@ def make_levels(base: FrozenBase, request: LadderRequest, resume: str | Path | N
 def _make_levels(base: FrozenBase, request: LadderRequest, resume: str | Path | None) -> Ladder:
     """`make_levels` by zoom."""
     band = request.first_band(base.target(request.viewer), base.effects())
-    store = LevelStore(None if resume is None else Path(resume), base, request)
+    store = LevelStore(None if resume is None else path_of(resume, "resume"), base, request)
     with announced("rendering the base"):
         yardstick = Yardstick(base, request.seed)
     work = _Work(base, request, store, yardstick)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.errors import CheckpointError, MipmapPluginError, PluginError
+from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.detect import Checkpoint, detect
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import API_VERSION, BY_COMPANIONS, CERTAIN, PLAIN, Family, Files, Match
@@ -34,6 +35,9 @@ __all__ = [
     "register_model",
 ]  # fmt: skip
 
+# Of a float32, which all backends draw.
+BYTES = 4
+
 # Names from `base`, which is imported when one of them is first used.
 _OF_BASE = ("SplatModel", "TrainedScale", "Traits")
 
@@ -51,7 +55,8 @@ def load_model(path: str | Path, *, iteration: int | None = None) -> SplatModel:
     third-party loader cannot be imported, fails, or returns an object that is not a model.
     """
     checkpoint = detect(path, iteration=iteration)
-    if (folder := opened(Path(path))) != Path(path):
+    path = path_of(path)
+    if (folder := opened(path)) != path:
         with told_of_archives():
             return load_model(folder, iteration=iteration)
     from mipmap_plugin.models.contract import lacking
@@ -72,6 +77,8 @@ def load_model(path: str | Path, *, iteration: int | None = None) -> SplatModel:
         raise PluginError(f"family {family.name!r} loads {type(model).__name__}, which lacks {', '.join(missing)}; see mipmap_plugin.models.base")
     if is_third_party(model) and model.family != family.name:
         raise PluginError(f"family {family.name!r} loads {type(model).__name__}, whose `family` is {model.family!r}; set it to {family.name!r}")
+    if family not in BUILT_IN and any(tensor.element_size() > BYTES for tensor in model.parameters().values()):
+        model.notes.append(f"family {family.name!r} loads float64, which only the slow backend reference draws; its load should return float32")
     return model
 
 

@@ -26,6 +26,9 @@ CARRIED = "carried"
 # What the rows of most models are.
 SPLATS = "splats"
 
+# Names of effects of models.
+TIME, BY_VIEW = "time", "view-dependent geometry"
+
 # By which the activation of a third-party family may leave 0..1.
 OPACITY_ROUNDING = 1e-4
 
@@ -231,5 +234,11 @@ def digest_of_parameters(model: SplatModel) -> str:
 
 
 def effects_of(model: SplatModel) -> list[Effect]:
-    """The effects that the model itself simulates, including exposure."""
-    return [model.traits.exposures.effect(), *model.traits.effects]
+    """The effects that the model itself simulates, including exposure. What a model does not report is taken from its other traits."""
+    traits = model.traits
+    reported = [traits.exposures.effect(), *traits.effects]
+    if traits.moves and TIME not in {effect.name for effect in traits.effects}:
+        reported.append(Effect(TIME, True, "the splats move", "making the splats for each moment"))
+    if not (traits.effects or traits.moves or traits.same_for_all_views or traits.filtered):
+        reported.append(Effect(BY_VIEW, True, "the splats are made for each camera", "making the splats for each camera"))
+    return reported

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from mipmap_plugin.errors import CheckpointError, PluginError
 from mipmap_plugin.formats.atomic import settled
+from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import OF_SPLATS, Family, Files, Match
 from mipmap_plugin.models.places import REPORT
@@ -44,7 +45,7 @@ def detect(path: str | Path, *, iteration: int | None = None) -> Checkpoint:
     """
     if path == "":
         raise CheckpointError("no path was given; give a PLY file or a model folder")
-    path = settled(Path(path))
+    path = settled(path_of(path))
     if path.is_dir():
         return _detect_folder(path, iteration)
     if (folder := opened(path)) != path:

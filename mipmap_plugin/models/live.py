@@ -70,8 +70,8 @@ def adopt(model: Any) -> SplatModel:
 
     Accepted are a `GaussianModel` of INRIA's 3DGS or of a project that only trains it differently, Scaffold-GS's
     `GaussianModel`, gsplat's `splats` (a dict or a ParameterDict) or what holds them under that name, as its trainer and its checkpoints do,
-    splatfacto's model or its `gauss_params`, and `Gaussians`. Tensors may be NumPy arrays. The copy is on the original's device. Splats that
-    are not finite are dropped, as when a file is loaded.
+    splatfacto's model, its `gauss_params`, and nerfstudio's pipeline or trainer around it, and `Gaussians`. Tensors may be NumPy arrays. The copy
+    is on the original's device. Splats that are not finite are dropped, as when a file is loaded.
     Raises SettingsError for another object, ShapeError for tensors that do not fit together, CheckpointError
     for networks that do not fit their anchors.
     """
@@ -96,6 +96,7 @@ def adopt(model: Any) -> SplatModel:
         adopted = _adopted(model, raw, TrainedScale(), Origin())
         adopted.notes += [] if hasattr(model, "capture") else [MAY_MOVE.format(name=_name(model))]
         return adopted
+    model = _of_nerfstudio(model)
     tensors = _mapping(getattr(model, "gauss_params", getattr(model, "splats", model)))
     tensors = _mapping(tensors["splats"]) if isinstance(tensors.get("splats"), Mapping | torch.nn.ParameterDict) else tensors
     if set(splatfacto.NAMES) <= set(tensors):
@@ -104,7 +105,24 @@ def adopt(model: Any) -> SplatModel:
     if set(gsplat.NAMES) == set(tensors):
         return _adopted(model, _copied(model, tensors), TrainedScale(near_plane=gsplat.NEAR_PLANE, up=gsplat.UP), Origin(host=gsplat.GsplatHost()))
     content = f" with {', '.join(map(str, list(tensors)[:8]))}" if tensors else ""
-    raise SettingsError(f"a {_name(model)}{content} is not a known kind of model; give a path, a GaussianModel, or gsplat's dictionary of splats")
+    raise SettingsError(f"a {_name(model)}{content} is not a known kind of model; {_advice(model, tensors)}")
+
+
+def _of_nerfstudio(model: Any) -> Any:
+    """The model within nerfstudio's pipeline or trainer; anything else as it is."""
+    within = getattr(getattr(model, "pipeline", model), "model", None)
+    return within if hasattr(within, "gauss_params") else model
+
+
+def _advice(model: Any, tensors: Mapping[str, Any]) -> str:
+    """What to give instead of an object that is not known."""
+    if callable(getattr(getattr(model, "model", None), "gaussians", None)):  # what is wrapped, or adapted
+        return "give its attribute `model`"
+    if "means" in tensors:
+        lacks, beside = (", ".join(sorted(map(str, names))) for names in (set(gsplat.NAMES) - set(tensors), set(tensors) - set(gsplat.NAMES)))
+        unlike = [f"lacks {lacks}"] * bool(lacks) + [f"has {beside} besides"] * bool(beside)
+        return f"gsplat's dictionary has {', '.join(gsplat.NAMES)} (for SH degree 0 shN is empty, [N, 0, 3]), and this one {' and '.join(unlike)}"
+    return "give a path, a GaussianModel, gsplat's dictionary of splats, or nerfstudio's model"
 
 
 def _checked(model: SplatModel) -> SplatModel:

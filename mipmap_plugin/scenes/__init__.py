@@ -8,6 +8,7 @@ from typing import Any
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.json_file import read_json
+from mipmap_plugin.limits import path_of
 from mipmap_plugin.scenes.base import Scene
 from mipmap_plugin.scenes.cameras_json import read_cameras, write_cameras
 from mipmap_plugin.scenes.colmap import is_colmap, read_colmap
@@ -31,7 +32,7 @@ def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     with both COLMAP's `sparse` and transforms files is read from `sparse`, as graphdeco-inria does.
     Raises SceneError.
     """
-    path = Path(path)
+    path = path_of(path)
     if not path.exists():
         raise SceneError(f"{path}: there is no such file or folder; check the path")
     if path.is_file():

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import OPENGL_TO_OPENCV, Camera
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import ROTATION_TOLERANCE, numbers, pixels, positive, present, read_json, rotation
@@ -27,9 +27,6 @@ USUAL_TURN = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
 
 # Radians: a smaller angle of view is longer than any lens, and its tangent may underflow.
 MIN_ANGLE = 1e-9
-
-# OpenGL's camera looks along -z with y up, OpenCV's along +z with y down.
-OPENGL_TO_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 
 
 def read_transforms(path: str | Path) -> Scene:

@@ -179,7 +179,7 @@ register_viewer("portable", tuple(viewer.name for viewer in BUILT_IN if viewer n
 
 
 def _registered(name: str) -> Any:
-    if name in NO_RECORD and name not in VIEWERS.names():
+    if isinstance(name, str) and name in NO_RECORD and name not in VIEWERS.names():
         raise SettingsError(f"viewer {name}: {NO_RECORD[name]}")
     return VIEWERS.get(name)
 

@@ -43,7 +43,7 @@ def no_work(monkeypatch):
 @pytest.mark.parametrize("scale", [*BAD_SCALES, *NO_SCALES])
 @pytest.mark.parametrize("recipe", ["instant", "default"])
 def test_scales_that_nothing_can_be_adapted_to(model, no_work, scale, recipe):
-    with pytest.raises(SettingsError, match=r"scale must be from 1e-09 to 10000, such as 0\.25 or 4, got "):
+    with pytest.raises(SettingsError, match=r"scale must be from 1e-09 to 10000, a number such as 0\.25 or 4, got "):
         model.adapt(scale, recipe=recipe)
 
 

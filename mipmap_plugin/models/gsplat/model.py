@@ -80,6 +80,8 @@ class GsplatHost:
         if points is None:
             advice = "give the COLMAP scene that it was trained on"
             own = "if its cameras are in the frame of the splats, the cfg.yml of its result folder has to say normalize_world_space: false"
+            if self.folder is None:  # a live one has no such file
+                own += ", or give wrap_model the cameras themselves (load_scene(path).cameras)"
             raise SceneError(f"gsplat trained in a normalized coordinate frame, which is computed from the points of COLMAP: {advice}; {own}")
         frame = normalized_frame(cameras, points, means)
         return [camera.moved(frame) for camera in resized]
