@@ -42,7 +42,7 @@ from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, explain
-from mipmap_plugin.models.base import SplatModel, count_of, digest_of_parameters, effects_of
+from mipmap_plugin.models.base import SplatModel, count_of, digest_of_model, digest_of_parameters, effects_of
 from mipmap_plugin.models.health import doubts_in
 from mipmap_plugin.process import pool, threads
 from mipmap_plugin.process.clock import now
@@ -253,7 +253,7 @@ class Session:
 
     def _fingerprint(self) -> str:
         """A hash of everything that a run depends on, so that a state is never resumed as another run."""
-        base = self.base.digest or digest_of_parameters(self.base)
+        base = digest_of_model(self.base)
         targets = [asdict(target) for target in self.targets.values()]
         base += "" if self.finer is None else digest_of_parameters(self.finer.model)
         settings, views = self.config.model_dump(), digest_of(self.views)
@@ -276,7 +276,7 @@ class Session:
             warn(note)
         return Report(
             scale=self.scale,
-            base=self.base.digest or digest_of_parameters(self.base),
+            base=digest_of_model(self.base),
             settings=self.config.model_copy(update={"validation_views": self.asked.validation_views}),  # which a time budget bounds
             backend=self.backend_note,
             views=self.views_note,

@@ -21,7 +21,7 @@ from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.base import Filtered, SplatModel, digest_of_parameters
+from mipmap_plugin.models.base import Filtered, SplatModel, digest_of_model
 from mipmap_plugin.models.places import REPORT, STATE, state_path
 
 # Written before the first level: what was broken off earlier leaves the state of a run at most.
@@ -95,6 +95,6 @@ def _trained(base: FrozenBase, target: Effects) -> Any:
 
 def _facts(base: FrozenBase, request: LadderRequest) -> dict[str, Any]:
     """Everything that the levels depend on."""
-    of_base = {"base": base.model.digest or digest_of_parameters(base.model), "trained": str(base.trained), "background": base.background}
+    of_base = {"base": digest_of_model(base.model), "trained": str(base.trained), "background": base.background}
     made_with = {"backend": base.backend(viewer=request.viewer)[0].name, "versions": versions()}
     return {**of_base, "cameras": digest_of(base.cameras), "request": request.facts(), **made_with}

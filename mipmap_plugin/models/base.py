@@ -230,6 +230,11 @@ def digest_of_parameters(model: SplatModel) -> str:
     return digest.hexdigest()
 
 
+def digest_of_model(model: SplatModel) -> str:
+    """What a model is known by: the sha256 of its file, or else of its parameters."""
+    return model.digest or digest_of_parameters(model)
+
+
 def effects_of(model: SplatModel) -> list[Effect]:
     """The effects that the model itself simulates, including exposure."""
     return [model.traits.exposures.effect(), *model.traits.effects]
