@@ -114,6 +114,7 @@ def test_values_that_look_activated_are_reported_and_not_changed(name, flag):
     assert torch.equal(model.parameters()[name], before)
 
 
+@pytest.mark.usefixtures("brief_ladders")
 @pytest.mark.parametrize(("column", "sentence"), [("scale_{}", LINEAR), ("opacity", ACTIVATED)])
 @pytest.mark.parametrize("words", [["adapt", "--scale", "1/2", "--recipe", "instant"], *(
     ["levels", "--viewer", "playcanvas", "--coarsest", "1/2", "--steps", "1", "--by", by] for by in ("zoom", "distance"))])  # fmt: skip
