@@ -33,7 +33,8 @@ from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.health import ACTIVATED
 from mipmap_plugin.models.mip import MipModel
-from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
+from mipmap_plugin.models.reading import load_vanilla
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.screen_filters import DILATION
