@@ -223,7 +223,7 @@ class Session:
     def _for_target(self, model: SplatModel, *, shared: bool = False) -> SplatModel:
         """A copy of a model that is rendered with the target's screen filter; `shared`: with the model's tensors, if it can have these."""
         model = getattr(model, "shared", model.copy)() if shared else model.copy()
-        model.trained = replace(model.trained, screen_filter=self.effects.screen_filter, eps2d=self.effects.eps2d)
+        model.trained = model.trained.drawn_with(self.effects)
         return model
 
     @contextmanager

@@ -14,7 +14,6 @@ from typing import Any, cast
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.report import Report, versions
 from mipmap_plugin.camera import digest_of
-from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import MipmapPluginError, SettingsError, brief
 from mipmap_plugin.formats.atomic import json_text, refuse_unwritable, settled, write_json
 from mipmap_plugin.formats.json_file import read_json
@@ -84,13 +83,9 @@ class LevelStore:
             raise SettingsError(f"{file}: this level of an unfinished ladder is damaged ({brief(error)}); delete its folder to start anew") from error
         plain: SplatModel = cast(Filtered, read).bare() if read.traits.filtered else read  # the filter of a file for Mip-Splatting is 0
         model = plain.to(self._base.model.parameters()["means"].device)
-        model.trained = _trained(self._base, self._target)
+        model.trained = self._base.trained.drawn_with(self._target)
         backend, _ = self._base.backend(viewer=report.viewer)
         return Adapted(model, report, backend, self._target, {str(report.viewer): self._target}, cameras=self._base.views())
-
-
-def _trained(base: FrozenBase, target: Effects) -> Any:
-    return replace(base.trained, screen_filter=target.screen_filter, eps2d=target.eps2d)
 
 
 def _facts(base: FrozenBase, request: LadderRequest) -> dict[str, Any]:

@@ -236,8 +236,7 @@ class TiledScene:
 
     def for_target(self, parameters: dict[str, Tensor]) -> VanillaModel:
         """A model of some splats, as it is saved for the target; its parameters are leaves that require gradients."""
-        trained = replace(self.wrapped.model.trained, screen_filter=self.target.screen_filter, eps2d=self.target.eps2d)
-        return self.kind(parameters, trained).copy()
+        return self.kind(parameters, self.wrapped.model.trained.drawn_with(self.target)).copy()
 
     def painter(self, effects: Effects) -> Painter:
         """What draws splats from the disk."""

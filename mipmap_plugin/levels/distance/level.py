@@ -165,8 +165,8 @@ class LevelRun:
 
     def _for_target(self) -> SplatModel:
         """A copy of the finer level that is rendered with the target's screen filter."""
-        student, target = self.finer[-1].copy(), self.scene.target
-        student.trained = replace(student.trained, screen_filter=target.screen_filter, eps2d=target.eps2d)
+        student = self.finer[-1].copy()
+        student.trained = student.trained.drawn_with(self.scene.target)
         return student
 
     def _coarser(self, weights: Tensor | None, kept: int) -> SplatModel:
