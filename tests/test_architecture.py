@@ -183,11 +183,13 @@ def test_outside_libraries_stay_in_their_modules():
     assert offenders(strays) == {}
 
 
-def test_importing_the_package_and_its_backends_loads_nothing_optional():
+def test_importing_what_every_command_needs_loads_nothing_optional():
+    """The package, its backends, and what `inspect` compares viewers with."""
     optional = ["numba", "llvmlite", "gsplat", "triton", "matplotlib", "pycolmap", "pytest", "skimage", "tyro"]
     optional += ["dask", "distributed", "spandrel", "safetensors", "lpips", "torchvision", "viser"]
-    package = ", ".join(f"mipmap_plugin.backends.{name}" for name in ("cpu", "gsplat", "inria", "triton"))
-    code = f"import sys, {package}; print([name for name in {optional} if name in sys.modules])"
+    modules = [f"mipmap_plugin.backends.{name}" for name in ("cpu", "gsplat", "inria", "triton")]
+    modules.append("mipmap_plugin.evaluation.viewer_differences")
+    code = f"import sys, {', '.join(modules)}; print([name for name in {optional} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent, check=True)
     assert done.stdout.strip() == "[]"
 

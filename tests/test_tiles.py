@@ -44,9 +44,10 @@ from mipmap_plugin.tiles.folder import work_folder
 from mipmap_plugin.tiles.halo import draw_halos
 from mipmap_plugin.tiles.layers import draw_layers
 from mipmap_plugin.tiles.pictures import Album, write_pictures
+from mipmap_plugin.tiles.reading import make_cut
 from mipmap_plugin.tiles.report import make_report
 from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
-from mipmap_plugin.tiles.scene import make_cut, opened
+from mipmap_plugin.tiles.scene import opened
 from mipmap_plugin.tiles.slabs import Painter
 from mipmap_plugin.tiles.splats import Splats
 from mipmap_plugin.tiles.start import StartSearch
