@@ -7,7 +7,7 @@ import json
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 from mipmap_plugin.adaptation.adapted import Adapted
@@ -165,8 +165,8 @@ class Session:
         targets = [unrounded(target) for target in self.extremes.values()]
         first, *further = [Renderer(self.backend, target) for target in targets]
         together, stepping = views_renderer(self.backend, targets), SteppingRenderer.of(self.backend, targets)
-        task = Task(self.views, self.scale, self.truth, first, self._white, self.validation, self.detail, max_splats, further, together, stepping)
-        task = replace(task, follow=Following(self.base, self.views, self.scale))
+        white, follow = self.effects.background == (1.0, 1.0, 1.0), Following(self.base, self.views, self.scale)
+        task = Task(self.views, self.scale, self.truth, first, white, self.validation, self.detail, max_splats, further, together, stepping, follow)
         keeper = StateKeeper(resume, self._fingerprint())
         if not any(target.sh_degree for target in self.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no viewer evaluates view-dependent color, so that these coefficients need no gradient
@@ -224,10 +224,6 @@ class Session:
     @property
     def _has_blend_weights(self) -> bool:
         return self.has_gradients and self.base.traits.same_for_all_views
-
-    @property
-    def _white(self) -> bool:
-        return self.effects.background == (1.0, 1.0, 1.0)
 
     def _fingerprint(self) -> str:
         """A hash of everything that a run depends on, so that a state is never resumed as another run."""
