@@ -34,9 +34,9 @@ from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.splat_transform import TOOL, find_tool
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance.ladder import scene_of
-from mipmap_plugin.levels.distance.level import Scene
 from mipmap_plugin.levels.distance.mixture import Mixture
 from mipmap_plugin.levels.distance.rule import DistanceRule
+from mipmap_plugin.levels.distance.scene import Scene
 from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground
 from mipmap_plugin.levels.manifest import MANIFEST
 from mipmap_plugin.levels.request import LadderRequest

@@ -53,7 +53,7 @@ def memory_in_use() -> int:
 def load(path: Path) -> None:
     """Load `path` in this process, and print seconds, bytes at the peak, and splats."""
     from mipmap_plugin import load_model
-    from mipmap_plugin.models.vanilla import load_vanilla  # imports are not billed
+    from mipmap_plugin.models.reading import load_vanilla  # imports are not billed
 
     del load_vanilla
     before, began = memory_in_use(), time.perf_counter()

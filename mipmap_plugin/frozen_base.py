@@ -15,7 +15,7 @@ from mipmap_plugin.adaptation import notebook
 from mipmap_plugin.adaptation.adapted import Adapted, as_start, render_model
 from mipmap_plugin.adaptation.choosing import choose, mergeable_settings
 from mipmap_plugin.adaptation.conversion import Stages, conversion
-from mipmap_plugin.adaptation.session import AdaptationRequest, Observer
+from mipmap_plugin.adaptation.request import AdaptationRequest, Observer
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import LIMIT, BaseImages
 from mipmap_plugin.adaptation.target.photographs import Photographs, placed

@@ -51,3 +51,11 @@ def nothing_that_is_registered_stays():
 def small_orbits(monkeypatch):
     """Views of a generated orbit of 24 px, in place of 800: for tests of a file without cameras, whose pictures do not matter."""
     monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 24)
+
+
+@pytest.fixture
+def brief_ladders(monkeypatch):
+    """Levels by zoom are compared in one view and at few zooms: for tests of a ladder whose dB do not matter."""
+    monkeypatch.setattr("mipmap_plugin.levels.yardstick.VIEWS", 1)
+    monkeypatch.setattr("mipmap_plugin.levels.switching.FIRST_STEP", 2.0)
+    monkeypatch.setattr("mipmap_plugin.levels.switching.SECOND_STEP", 2.0)

@@ -18,7 +18,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 # Torch knows the device "meta" without anything being installed, and computes nothing there by itself.
-DEVICE = "meta"
+DEVICE, HERE = "meta", torch.device("cpu")
 if not hasattr(torch, DEVICE):
     torch.meta = types.ModuleType("torch.meta")  # where torch before 2.8 looks for a device's random numbers, to leave them alone
 
@@ -57,22 +57,27 @@ class Pretended(torch.Tensor):
 class Device(TorchDispatchMode):
     """What computes, refuses and takes notes."""
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """No: nothing here is compiled, and torch would import its compiler to leave each operation out of it."""
+        return False
+
     def __init__(self) -> None:
         super().__init__()
         self.waits: Counter[str] = Counter()  # by the line of the package that asks
         self.operations = 0
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        kwargs = dict(kwargs or {})
         tensors: list[torch.Tensor] = []
-        _mapped(lambda part: tensors.append(part) if isinstance(part, torch.Tensor) else None, (args, kwargs))
+        inner_args = _inner(args, tensors)
+        inner_kwargs = {name: _inner(value, tensors) for name, value in kwargs.items()} if kwargs else {}
         there = any(isinstance(tensor, Pretended) for tensor in tensors)
         if any(tensor.is_meta and not isinstance(tensor, Pretended) for tensor in tensors):
             raise RuntimeError(f"{func}: a tensor was made where nobody looked, and holds nothing")
-        target = kwargs.get("device")
+        target = inner_kwargs.get("device")
         goes_there = there if target is None else torch.device(target).type == DEVICE
         if not there and not goes_there:
-            return func(*args, **kwargs)
+            return func(*args, **inner_kwargs)
         self.operations += 1
         if func.overloadpacket.__name__ in CPU_ONLY:
             raise RuntimeError(f"{func}: torch has it for processors alone")
@@ -82,9 +87,9 @@ class Device(TorchDispatchMode):
         if self._waits(func, args, there and not goes_there):
             self.waits[_asker()] += 1
         if target is not None:
-            kwargs["device"] = torch.device("cpu")
-        result = func(*_mapped(_inner, args), **_mapped(_inner, kwargs))
-        return _wrapped(result, tensors) if goes_there else result
+            inner_kwargs["device"] = HERE
+        result = func(*inner_args, **inner_kwargs)
+        return _outer(result, [tensor for tensor in tensors if isinstance(tensor, Pretended)]) if goes_there else result
 
     @staticmethod
     def _waits(func, args, comes_back: bool) -> bool:
@@ -114,23 +119,23 @@ def pretending() -> Iterator[Device]:
         yield device
 
 
-def _mapped(function, value):
-    """Torch's own `tree_map` takes ten times as long, for what no operation is given."""
-    if isinstance(value, list | tuple):
-        return type(value)([_mapped(function, part) for part in value])
-    if isinstance(value, dict):
-        return {name: _mapped(function, part) for name, part in value.items()}
-    return function(value)
+def _inner(value, tensors):
+    """What a function is given, with the tensors of the processor in place of those that pretend, and those in `tensors`.
+
+    Torch's own `tree_map` takes ten times as long, for what no operation is given.
+    """
+    if isinstance(value, torch.Tensor):
+        tensors.append(value)
+        return value.inner if isinstance(value, Pretended) else value
+    return type(value)([_inner(part, tensors) for part in value]) if isinstance(value, list | tuple) else value
 
 
-def _inner(value):
-    return value.inner if isinstance(value, Pretended) else value
-
-
-def _wrapped(result, tensors):
-    """What was written in place stays the tensor that it was."""
-    known = {id(tensor.inner): tensor for tensor in tensors if isinstance(tensor, Pretended)}
-    return _mapped(lambda part: (known[id(part)] if id(part) in known else Pretended(part)) if isinstance(part, torch.Tensor) else part, result)
+def _outer(result, pretended):
+    """What a function returns, as pretending tensors. What was written in place stays the tensor that it was."""
+    if isinstance(result, torch.Tensor):
+        written = [tensor for tensor in pretended if tensor.inner is result]
+        return written[0] if written else Pretended(result)
+    return type(result)([_outer(part, pretended) for part in result]) if isinstance(result, list | tuple) else result
 
 
 def _asker() -> str:

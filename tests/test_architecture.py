@@ -4,10 +4,13 @@ import ast
 import re
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
-import pytest
 import tiny
+
+from mipmap_plugin.models import Traits, load_model
 
 PACKAGE = Path(__file__).parents[1] / "mipmap_plugin"
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -73,10 +76,17 @@ def name_of(path: Path) -> str:
     return path.relative_to(PACKAGE).as_posix()
 
 
+@cache
+def nodes(path: Path) -> list[ast.AST]:
+    """Of the syntax of a file."""
+    return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+
+
+@cache
 def imports(path: Path) -> set[str]:
     """The full names of the modules that a file imports, at its top or inside its functions, with `import_module` too."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         if isinstance(node, ast.ImportFrom):
@@ -103,9 +113,14 @@ def breaches(name: str, imported: set[str]) -> list[str]:
     return sorted(other for other in ours if storey(other) >= storey(room(name)))
 
 
-@pytest.mark.parametrize("path", [path for path in MODULES if path != PACKAGE / "__init__.py"], ids=name_of)
-def test_imports_lead_downwards(path):
-    assert breaches(name_of(path), imports(path)) == []
+def offenders(found: Callable[[Path], list[str]], paths: list[Path] = MODULES) -> dict[str, list[str]]:
+    """What is found in files against a rule, by their names."""
+    return {name_of(path): wrong for path in paths if (wrong := found(path))}
+
+
+def test_imports_lead_downwards():
+    below = [path for path in MODULES if path != PACKAGE / "__init__.py"]
+    assert offenders(lambda path: breaches(name_of(path), imports(path)), below) == {}
 
 
 def test_a_breach_would_be_found():
@@ -160,18 +175,21 @@ def test_a_circle_would_be_found():
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}) == [["b", "c"]]
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_outside_libraries_stay_in_their_modules(path):
-    outside = {name.split(".")[0] for name in imports(path)} - sys.stdlib_module_names - {"mipmap_plugin", "torch"}
-    for library in outside:
-        assert any(name_of(path).startswith(place) for place in CONFINED.get(library, [])), f"{library} in {name_of(path)}"
+def test_outside_libraries_stay_in_their_modules():
+    def strays(path: Path) -> list[str]:
+        outside = {name.split(".")[0] for name in imports(path)} - sys.stdlib_module_names - {"mipmap_plugin", "torch"}
+        return sorted(library for library in outside if not name_of(path).startswith(tuple(CONFINED.get(library, []))))
+
+    assert offenders(strays) == {}
 
 
-def test_importing_the_package_and_its_backends_loads_nothing_optional():
+def test_importing_what_every_command_needs_loads_nothing_optional():
+    """The package, its backends, and what `inspect` compares viewers with."""
     optional = ["numba", "llvmlite", "gsplat", "triton", "matplotlib", "pycolmap", "pytest", "skimage", "tyro"]
     optional += ["dask", "distributed", "spandrel", "safetensors", "lpips", "torchvision", "viser"]
-    package = ", ".join(f"mipmap_plugin.backends.{name}" for name in ("cpu", "gsplat", "inria", "triton"))
-    code = f"import sys, {package}; print([name for name in {optional} if name in sys.modules])"
+    modules = [f"mipmap_plugin.backends.{name}" for name in ("cpu", "gsplat", "inria", "triton")]
+    modules.append("mipmap_plugin.evaluation.viewer_differences")
+    code = f"import sys, {', '.join(modules)}; print([name for name in {optional} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -196,36 +214,41 @@ def test_a_checkpoint_is_recognized_without_torch(tmp_path):
 import sys
 from mipmap_plugin.models import detect
 print(detect({str(ply)!r}).family, [name for name in ("torch", "numba") if name in sys.modules])
-from mipmap_plugin.models import Traits, load_model
-print(isinstance(load_model({str(ply)!r}).traits, Traits))
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert run.stdout.splitlines() == ["3dgs []", "True"]
+    assert run.stdout.strip() == "3dgs []"
+    assert isinstance(load_model(ply).traits, Traits)  # which is imported when it is first used
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_files_and_functions_stay_small(path):
-    text = path.read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= MAX_FILE
-    functions = [node for node in ast.walk(ast.parse(text)) if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))]
-    assert [f"{f.name}: {f.end_lineno - f.lineno + 1}" for f in functions if f.end_lineno - f.lineno + 1 > MAX_FUNCTION] == []
+def test_files_and_functions_stay_small():
+    def large(path: Path) -> list[str]:
+        functions = [node for node in nodes(path) if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))]
+        sizes = [(node.name, node.end_lineno - node.lineno + 1, MAX_FUNCTION) for node in functions]
+        sizes.append(("the file", len(path.read_text(encoding="utf-8").splitlines()), MAX_FILE))
+        return [f"{name}: {lines}" for name, lines, most in sizes if lines > most]
+
+    assert offenders(large) == {}
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_functions_have_few_arguments(path):
-    found = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.FunctionDef) and not f"{name_of(path)}: {node.name}".startswith(MANY_ARGUMENTS):
-            names = [each.arg for each in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs) if each.arg not in ("self", "cls")]
-            found += [f"{node.name}: {len(names)}"] if len(names) > MAX_ARGUMENTS else []
-    assert found == []
+def test_functions_have_few_arguments():
+    def with_many(path: Path) -> list[str]:
+        found = []
+        for node in nodes(path):
+            if isinstance(node, ast.FunctionDef) and not f"{name_of(path)}: {node.name}".startswith(MANY_ARGUMENTS):
+                names = [each.arg for each in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs) if each.arg not in ("self", "cls")]
+                found += [f"{node.name}: {len(names)}"] if len(names) > MAX_ARGUMENTS else []
+        return found
+
+    assert offenders(with_many) == {}
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_the_library_neither_prints_nor_evaluates_text(path):
-    calls = [node.func for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
-    forbidden = {"eval", "exec"} if room(name_of(path)) in {"cli", "commands"} else {"eval", "exec", "print"}
-    assert forbidden.isdisjoint(call.id for call in calls if isinstance(call, ast.Name))
+def test_the_library_neither_prints_nor_evaluates_text():
+    def forbidden(path: Path) -> list[str]:
+        names = {"eval", "exec"} if room(name_of(path)) in {"cli", "commands"} else {"eval", "exec", "print"}
+        called = {node.func.id for node in nodes(path) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}
+        return sorted(names & called)
+
+    assert offenders(forbidden) == {}
 
 
 def test_one_sentence_says_how_to_install_an_extra():

@@ -616,7 +616,7 @@ def test_a_full_disk_ends_in_one_sentence_and_leaves_the_old_file(run, tmp_path,
     assert output.read_text() == "precious" and sorted(path.name for path in tmp_path.iterdir()) == ["base.ply", "new.ply"]
 
 
-@pytest.mark.usefixtures("small_orbits")
+@pytest.mark.usefixtures("small_orbits", "brief_ladders")
 def test_levels_without_cameras_are_told_of_once(run, tmp_path):
     """Each of several levels is adapted to the orbit."""
     base = tiny.ply(tmp_path / "base.ply")

@@ -81,8 +81,8 @@ def test_after_a_tenth_of_the_run_the_estimate_is_right_within_thirty_percent(cl
 
 def test_evaluations_of_a_field_are_foretold_as_rates_fall(clock, monkeypatch, tmp_path):
     """Most of them lie in the first half of a run."""
-    total, told = run_and_estimates(clock, monkeypatch, load_model(moving.write_deformable(tmp_path / "moving")), steps=120)
-    assert told[60][0] > 0.6 * total
+    total, told = run_and_estimates(clock, monkeypatch, load_model(moving.write_deformable(tmp_path / "moving")), steps=60)
+    assert told[30][0] > 0.6 * total
     for passed, left in told:
         if passed > total / 10:
             assert left == pytest.approx(total - passed, rel=0.3, abs=0.01 * total)

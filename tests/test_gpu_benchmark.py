@@ -169,9 +169,9 @@ def test_the_report_and_its_files_are_named_after_the_device(tmp_path):
 
 
 def test_bases_are_adapted_and_judged(tmp_path):
-    tiny.folder(tmp_path / "checkpoints" / "bases" / "ball_32", tiny.cameras())
-    tiny.scene(tmp_path / "images" / "ball")
-    place = Place(tmp_path, "reference", "cpu", settings=(("steps", 4), ("extra_views", 4)))
+    tiny.folder(tmp_path / "checkpoints" / "bases" / "ball_32", tiny.cameras(2), count=20)
+    tiny.scene(tmp_path / "images" / "ball", count=20)
+    place = Place(tmp_path, "reference", "cpu", settings=(("steps", 4), ("extra_views", 1), ("validation_views", 2), ("merge_to", 1.0)))
     ball, absent, split = Base("ball_32", 1), Base("absent_100", 1), Base("ball_32", 1, 90)
     works = gpu_adaptation.works(place, [(ball, 1 / 2), (absent, 2), (split, 1 / 2)])
     assert [work.title for work in works] == ["adaptation: reference: ball_32 x0.5", "adaptation: reference: ball_32 in 90 x0.5"]
@@ -184,7 +184,7 @@ def test_bases_are_adapted_and_judged(tmp_path):
 
 
 def test_what_a_first_command_waits_for_is_measured(tmp_path, monkeypatch):
-    tiny.folder(tmp_path / "checkpoints" / "bases" / gpu_first_use.BASE, tiny.cameras())
+    tiny.folder(tmp_path / "checkpoints" / "bases" / gpu_first_use.BASE, tiny.cameras(2, width=16, height=12), count=5)
     usual, viewer = gpu_first_use.works("reference", tmp_path)
     assert (usual.what, viewer.what) == ("first use", "first use playcanvas")
     monkeypatch.setattr(gpu_first_use, "STEPS", 1)
@@ -192,7 +192,8 @@ def test_what_a_first_command_waits_for_is_measured(tmp_path, monkeypatch):
     assert row.first_s > row.compilation_s > 0 and row.again_s > 0
     page = report(Results(MACHINE, first_uses=[gpu_first_use.FirstUse("triton", "", 21.04, 9.5, 8.0, 0.4)]))
     assert cells(page.split("\n\n")[-1], 0) == ["triton", "-", "21.0", "9.5", "8.0", "0.4"]
-    with pytest.raises(RuntimeError, match="nobody"):
+    monkeypatch.setattr(gpu_first_use, "COMMAND", "raise SystemExit('there is no such backend')")
+    with pytest.raises(RuntimeError, match="there is no such backend"):
         list(gpu_first_use.measure("nobody", "", tmp_path))
 
 

@@ -101,7 +101,7 @@ def test_what_a_part_keeps_is_freed_before_the_next():
 @pytest.fixture
 def data(tmp_path):
     for name in ("ball_32", gpu_views.BASE):
-        tiny.folder(tmp_path / "checkpoints" / "bases" / name, tiny.cameras())
+        tiny.folder(tmp_path / "checkpoints" / "bases" / name, tiny.cameras(), count=20)
     tiny.scene(tmp_path / "images" / "ball")
     return tmp_path
 
@@ -115,7 +115,7 @@ def test_the_whole_flow_fills_every_part_and_goes_on_with_what_was_missing(data,
     monkeypatch.setattr(gpu, "FIRST", ((300, 64, 48),))
     monkeypatch.setattr(gpu_views, "WIDTHS", (32,))
     ball, check = Base("ball_32", 1), gpu_conformance.check
-    place = gpu_adaptation.Place(data, "cpu", "cpu", settings=(("steps", 2), ("extra_views", 1)))
+    place = gpu_adaptation.Place(data, "cpu", "cpu", settings=(("steps", 2), ("extra_views", 1), ("validation_views", 2)))
     monkeypatch.setattr(gpu_adaptation, "VIEWERS", ("playcanvas",))
     adaptations = [*gpu_adaptation.works(place, [(ball, 1 / 2)]), *gpu_adaptation.works_for_viewers(place, [(ball, 1 / 2)])]
     monkeypatch.setattr(gpu, "_adaptations", lambda *_: adaptations)

@@ -15,7 +15,8 @@ from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.health import ACTIVATED, LINEAR, drop, examine, units
 from mipmap_plugin.models.live import adopt
-from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
+from mipmap_plugin.models.reading import load_vanilla
+from mipmap_plugin.models.vanilla import VanillaModel
 
 FIELDS = {"means": "x", "scales": "scale_1", "quats": "rot_2", "opacities": "opacity", "sh0": "f_dc_1", "shN": "f_rest_7"}
 
@@ -114,6 +115,7 @@ def test_values_that_look_activated_are_reported_and_not_changed(name, flag):
     assert torch.equal(model.parameters()[name], before)
 
 
+@pytest.mark.usefixtures("brief_ladders")
 @pytest.mark.parametrize(("column", "sentence"), [("scale_{}", LINEAR), ("opacity", ACTIVATED)])
 @pytest.mark.parametrize("words", [["adapt", "--scale", "1/2", "--recipe", "instant"], *(
     ["levels", "--viewer", "playcanvas", "--coarsest", "1/2", "--steps", "1", "--by", by] for by in ("zoom", "distance"))])  # fmt: skip

@@ -31,18 +31,17 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import OutputError, OutputExists, SceneError, SettingsError
 from mipmap_plugin.evaluation.tradeoff.points import on_backend
-from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.contents import Contents, LeftOut, Level
 from mipmap_plugin.levels.ladder import MORE_SPLATS, NOT_BETTER, UNSHOWN, _no_use, _shown, make_levels
 from mipmap_plugin.levels.manifest import MANIFEST, base_pixel, write_ladder
 from mipmap_plugin.levels.request import FINEST_RATIO, NARROW, STEPS_KEPT, WIDE, Band, LadderRequest
-from mipmap_plugin.levels.switching import most_even, switching_zoom, zooms_between
-from mipmap_plugin.levels.yardstick import Yardstick
 from mipmap_plugin.models.base import Traits
 from mipmap_plugin.models.places import state_path
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.wrap import Interrupted
+
+pytestmark = pytest.mark.usefixtures("brief_ladders")
 
 BRIEF = dict(steps=1, extra_views=1, validation_views=2, warm_up=0, views_per_step=1)
 
@@ -273,33 +272,6 @@ def test_a_group_of_viewers_has_no_ladder():
         make_levels(wrapped(), request("portable"))
 
 
-# Switches
-
-
-def test_switches_lie_where_both_levels_are_equally_good():
-    def falls_and_rises(zoom):
-        return 30 + 10 * math.log2(zoom / 0.25), 36 - 10 * math.log2(zoom / 0.25)
-
-    assert switching_zoom(0.25, 0.5, falls_and_rises) == pytest.approx(0.25 * 2**0.3, rel=0.02)
-
-
-def test_of_two_crossings_the_better_is_taken_and_without_one_the_closest_zoom():
-    assert most_even([(20, 20.2), (24, 21), (29, 29.4), (31, 30)]) == 2
-    assert most_even([(10, 20), (12, 20), (12, 15)]) == 2
-
-
-def test_a_switch_lies_on_the_better_side_of_a_step():
-    """Images of 15 and of 16 pixels, say."""
-    zoom = switching_zoom(0.5, 1.0, lambda zoom: (32.5, 32.9) if zoom < 0.7 else (34.3, 31.0))
-    assert 0.5 <= zoom < 0.7
-
-
-def test_zooms_include_both_ends():
-    assert zooms_between(0.25, 0.25, 2) == [0.25]
-    assert zooms_between(0.25, 1, 2) == pytest.approx([0.25, 0.5, 1])
-    assert len(zooms_between(0.25, 1.01, 2)) == 4
-
-
 # Ladders
 
 
@@ -383,7 +355,7 @@ def test_splats_in_no_picture_have_no_part_in_the_size_of_a_pixel():
     behind = tiny.gaussians(60, spread=1e-4, seed=2)
     eye = views[0].center.float()
     hidden = replace(behind, means=behind.means + eye + 0.2 * eye / eye.norm())
-    both = Gaussians(*(torch.cat(pair) for pair in zip(_columns(ball), _columns(hidden), strict=True)))
+    both = ball.joined(hidden)
     sizes = [base_pixel(wrap_model(VanillaModel.from_gaussians(each), cameras=views)) for each in (ball, both, hidden)]
     assert sizes[0] == sizes[1] and 0 < sizes[2] < sizes[0] / 5
 
@@ -617,20 +589,3 @@ def test_the_command_makes_a_ladder_and_prints_it(tmp_path, capsys):
     assert "2 levels" in said and "level_1.ply  x0.5, shown up to" in said and "at worst" in said
     assert not state_path(tmp_path / "ladder").exists() and not (tmp_path / "ladder" / "report.html").exists()
     assert cli.main(words) == 2 and "--overwrite" in capsys.readouterr().err
-
-
-def test_levels_are_measured_by_views_that_show_something():
-    """Between objects far apart most random views show nothing."""
-    one, other = tiny.gaussians(40), tiny.gaussians(40, seed=2)
-    away = torch.tensor([1000.0, 0.0, 0.0])
-    both = Gaussians(*(torch.cat(pair) for pair in zip(_columns(one), _columns(replace(other, means=other.means + away)), strict=True)))
-    there = torch.eye(4, dtype=torch.float64)
-    there[:3, 3] = away.double()
-    cameras = [*tiny.cameras(3), *(view.moved(there) for view in tiny.cameras(3))]
-    base = wrap_model(VanillaModel.from_gaussians(both), cameras=cameras)
-    yardstick = Yardstick(base, seed=0)
-    assert len(yardstick._images) == 4 and all(image.std() > 0 for image in yardstick._images.values())
-
-
-def _columns(gaussians):
-    return gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh

@@ -22,6 +22,8 @@ from mipmap_plugin.levels.streamed import EXTENT, distances, nearer, progression
 from mipmap_plugin.levels.tiles import SCREEN_ERROR, bounding_box, errors, tileset, write_tile, write_tiles
 from mipmap_plugin.models import load_model
 
+pytestmark = pytest.mark.usefixtures("brief_ladders")
+
 # A stand-in for splat-transform: it lists no GPU, writes its arguments to the output, with two chunks, and fails for a file that says that it is
 # broken, or has SH degree 4. Of an SPZ it writes the header: 60 splats of degree 1.
 STAND_IN = """#!{python}
@@ -76,6 +78,13 @@ def ladder(tmp_path):
         tiny.ply(tmp_path / "ladder" / level["file"])
     write_json(tmp_path / "ladder" / MANIFEST, LADDER, overwrite=False)
     return tmp_path / "ladder"
+
+
+def made_of_two_levels(folder, *options):
+    """A command that makes a ladder in the folder."""
+    base = tiny.folder(folder / "base", tiny.cameras(2, width=16, height=12), count=20)
+    words = ["levels", str(base), "--viewer", "playcanvas", "--output", str(folder / "ladder"), "--coarsest", "1/2"]
+    return [*words, "--by", "zoom", "--views", "given", *options]
 
 
 def test_a_switch_lies_at_the_distance_where_a_base_pixel_has_its_zoom():
@@ -255,8 +264,7 @@ def test_streamed_sog_of_one_level_is_refused_before_any_work(tmp_path, tool, ca
 
 def test_a_ladder_that_came_out_as_one_level_is_kept_for_a_command_that_does_not_stream_it(tmp_path, tool, capsys, monkeypatch):
     monkeypatch.setattr("mipmap_plugin.levels.ladder._no_use", lambda *_: "no better")
-    words = ["levels", str(tiny.folder(tmp_path / "base")), "--viewer", "playcanvas", "--output", str(tmp_path / "ladder"), "--coarsest", "1/2"]
-    words += ["--by", "zoom", "--recipe", "instant", "--views", "given"]
+    words = made_of_two_levels(tmp_path, "--recipe", "instant")
     assert cli.main([*words, "--streamed-sog"]) == 2
     told = "a single level, which needs no streaming; leave --streamed-sog out, which goes on from what is made"
     assert told in capsys.readouterr().err and not (tmp_path / "ladder").exists()
@@ -266,8 +274,7 @@ def test_a_ladder_that_came_out_as_one_level_is_kept_for_a_command_that_does_not
 
 @pytest.mark.parametrize("at", ["mipmap_plugin.levels.ladder.write_ladder", "mipmap_plugin.levels.store.LevelStore._loaded"])
 def test_a_disk_that_fills_leaves_the_finished_levels_for_the_same_command(tmp_path, capsys, monkeypatch, at):
-    words = ["levels", str(tiny.folder(tmp_path / "base")), "--viewer", "playcanvas", "--output", str(tmp_path / "ladder"), "--coarsest", "1/2"]
-    words += ["--by", "zoom", "--steps", "1", "--views", "given"]
+    words = made_of_two_levels(tmp_path, "--steps", "1")
 
     def full(*arguments):
         raise OutputError("the disk is full")
@@ -282,8 +289,7 @@ def test_a_disk_that_fills_leaves_the_finished_levels_for_the_same_command(tmp_p
 
 @pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt, 130), (lambda: OutputError("the disk is full"), 2)], ids=["Ctrl-C", "error"])
 def test_an_export_that_ends_early_loses_no_level(tmp_path, tool, capsys, monkeypatch, error, code):
-    words = ["levels", str(tiny.folder(tmp_path / "base")), "--viewer", "playcanvas", "--output", str(tmp_path / "ladder"), "--coarsest", "1/2"]
-    words += ["--by", "zoom", "--steps", "1", "--views", "given", "--streamed-sog"]
+    words = made_of_two_levels(tmp_path, "--steps", "1", "--streamed-sog")
 
     def ends(*arguments):
         raise error()

@@ -15,7 +15,8 @@ from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.levels.distance.ladder import scene_of
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.recipes import recipe
-from mipmap_plugin.tiles.scene import make_cut, opened
+from mipmap_plugin.tiles.reading import make_cut
+from mipmap_plugin.tiles.scene import opened
 
 AWAY = torch.eye(4)
 AWAY[2, 3] = -1000.0  # all splats lie behind it

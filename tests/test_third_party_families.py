@@ -18,7 +18,8 @@ from mipmap_plugin.models import API_VERSION, CERTAIN, PLAIN, Family, Match, Tra
 from mipmap_plugin.models.adapted_name import adapted_name
 from mipmap_plugin.models.conformance import ModelSuite
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family
-from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
+from mipmap_plugin.models.reading import load_vanilla
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import write_cameras
 
 EXAMPLE, FILES = (runpy.run_path(str(Path(__file__).parents[1] / "examples" / name)) for name in ("register_family.py", "register_family_files.py"))

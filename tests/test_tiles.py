@@ -34,7 +34,8 @@ from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.health import ACTIVATED
 from mipmap_plugin.models.mip import MipModel
-from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
+from mipmap_plugin.models.reading import load_vanilla
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.screen_filters import DILATION
@@ -44,9 +45,10 @@ from mipmap_plugin.tiles.folder import work_folder
 from mipmap_plugin.tiles.halo import draw_halos
 from mipmap_plugin.tiles.layers import draw_layers
 from mipmap_plugin.tiles.pictures import Album, write_pictures
+from mipmap_plugin.tiles.reading import find_splats, make_cut
 from mipmap_plugin.tiles.report import make_report
 from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
-from mipmap_plugin.tiles.scene import find_splats, make_cut, opened
+from mipmap_plugin.tiles.scene import opened
 from mipmap_plugin.tiles.slabs import Painter
 from mipmap_plugin.tiles.splats import Splats
 from mipmap_plugin.tiles.start import StartSearch

@@ -19,7 +19,8 @@ from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import OPACITY_MARGIN
 from mipmap_plugin.models.raw import MIN_SCALE
-from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
+from mipmap_plugin.models.reading import load_vanilla
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting.rotations import unit_quaternions
 from mipmap_plugin.wrap import wrap_model
 

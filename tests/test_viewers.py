@@ -1,7 +1,8 @@
 """Viewers: every rule against its shader, computed by hand for one splat in the middle of an image."""
 
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
+from functools import reduce
 
 import pytest
 import samples
@@ -379,7 +380,7 @@ def test_a_color_in_steps_keeps_its_gradient(backend):
 def test_spark_sorts_by_distance(backend):
     """The splat of lesser depth may be farther from the camera, if it is off-axis."""
     near, far = splat(900.0, 900.0, 1.0, 1.0, means=(0.0, 0.0, 10.0)), splat(900.0, 900.0, 1.0, 0.0, means=(4.6, 0.0, 9.9))
-    pair = Gaussians(*(torch.cat([getattr(near, f.name), getattr(far, f.name)]) for f in fields(near) if f.name != "covariances"))
+    pair = near.joined(far)
     wide = replace(camera(), width=120, cx=60.0)
     first = {name: backend.render(pair, wide, find_viewer(name).effects(Effects(0))).image[MIDDLE, 82, 0].item() for name in ("spark", "classic")}
     assert first["spark"] > 0.5 > first["classic"]
@@ -409,7 +410,7 @@ def test_playcanvas_does_not_sort_within_a_bucket(backend):
     drawn = {}
     for context in ((), (large,)):
         parts = (near, far, *context)
-        together = Gaussians(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(near) if f.name != "covariances"))
+        together = reduce(Gaussians.joined, parts)
         drawn[len(parts)] = backend.render(together, camera(), find_viewer("playcanvas").effects(Effects(0))).image[MIDDLE, MIDDLE, 0].item()
     assert drawn[2] > 0.9 and drawn[3] < 0.1
 
@@ -455,7 +456,7 @@ def test_a_viewer_does_not_sort_within_a_bucket(backend, viewer, front):
     nearer = replace(rows[0], means=rows[0].means - torch.tensor([0.0, 0.0, 0.01]))
     far = splat(1.0, 1.0, means=(0.0, 0.0, 1e4))
     for parts, expected in (((nearer, rows[1]), 0.0), ((nearer, rows[1], far), front), ((rows[1], nearer, far), 1 - front)):
-        together = Gaussians(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(far) if f.name != "covariances"))
+        together = reduce(Gaussians.joined, parts)
         drawn = backend.render(together, camera(), find_viewer(viewer).effects(Effects(0))).image[MIDDLE, MIDDLE, 0].item()
         assert drawn == pytest.approx(expected, abs=0.1)
 
@@ -467,7 +468,7 @@ def test_babylon_does_not_sort_within_a_bucket(backend):
     far = splat(1.0, 1.0, means=(0.0, 0.0, 1e4))
     drawn = []
     for parts in (rows, (*rows, far)):
-        together = Gaussians(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(far) if f.name != "covariances"))
+        together = reduce(Gaussians.joined, parts)
         drawn.append(backend.render(together, camera(), find_viewer("babylon").effects(Effects(0))).image[MIDDLE, MIDDLE, 0].item())
     assert drawn[0] > 0.9 and drawn[1] < 0.1
 
@@ -498,7 +499,7 @@ def test_the_order_is_one_or_the_other():
 def test_an_8_bit_image_is_rounded_after_every_splat_from_the_back(backend):
     settings = RenderSettings(min_alpha=0.5 / 255, max_alpha=0.999, min_transmittance=1e-6, picture_step=1 / 255)
     parts = [splat(30.0, 30.0, opacity, color, means=(0.0, 0.0, depth)) for opacity, color, depth in ((0.01, 0.3, 9.0), (0.3, 0.9, 10.0))]
-    both = Gaussians(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(parts[0]) if f.name != "covariances"))
+    both = parts[0].joined(parts[1])
     rendered = backend.render(both, camera(), Effects(0, settings=settings, background=(0.2, 0.2, 0.2)))
     behind = round(255 * (0.3 * 0.9 + 0.7 * 0.2)) / 255
     assert rendered.image[MIDDLE, MIDDLE, 0].item() == pytest.approx(round(255 * (0.01 * 0.3 + 0.99 * behind)) / 255, abs=1e-6)

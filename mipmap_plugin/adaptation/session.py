@@ -5,12 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict
 from pathlib import Path
-
-from torch import Tensor
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, is_true
@@ -28,10 +26,10 @@ from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Quality, Validation, split_validation
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, unrounded, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, versions
+from mipmap_plugin.adaptation.request import AdaptationRequest, Observer
 from mipmap_plugin.adaptation.start.candidates import UNMATCHED, StartSearch
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
-from mipmap_plugin.adaptation.start.problem import FinerLevel, StartProblem
-from mipmap_plugin.adaptation.target.base_images import BaseImages
+from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.adaptation.target.detail import DetailLoss
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
@@ -41,35 +39,15 @@ from mipmap_plugin.adaptation.views import choose_views, orbit_of, over_band, re
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.effects import Effect, Effects, explain
-from mipmap_plugin.models.base import SplatModel, count_of, digest_of_parameters, effects_of
+from mipmap_plugin.effects import Effect, explain
+from mipmap_plugin.models.base import SplatModel, count_of, digest_of_model, digest_of_parameters, effects_of
 from mipmap_plugin.models.health import doubts_in
 from mipmap_plugin.process import pool, threads
 from mipmap_plugin.process.clock import now
 from mipmap_plugin.progress import announced
 
-# (step, seconds of adapting so far, function that renders a camera of the new scale with the current model, without gradients)
-# -> True (Python's, NumPy's or torch's) to end the run with this step, and anything else to go on. Its time is not counted.
-Observer = Callable[[int, float, Callable[[Camera], Tensor]], object]
-
 # A zoom-in is validated against the base's own image, whatever it is adapted to.
 COMPARED_WITH_BASE = {"compare_at": "base", "quantize_truth": False}
-
-
-@dataclass(frozen=True)
-class AdaptationRequest:
-    """What is adapted, for which viewers, and by which backend."""
-
-    images: BaseImages  # of the model, rendered as in its training, by the backend
-    targets: Mapping[str, Effects]  # how the adapted file is rendered, by viewer; the file names the first of them
-    viewer: str | None  # the viewer (or group of viewers) that the file is made for; None: what draws as the training did
-    backend_note: str  # which backend was chosen, and why
-    has_gradients: bool  # whether the backend has gradients for this request
-    base_in_viewer: SplatModel  # what the viewer reads of the base's own file: mostly the base itself
-    finer: FinerLevel | None = None  # what the run starts from instead of the base
-    inputs: Mapping[str, str] = field(default_factory=dict)  # `Report.inputs`
-    up: tuple[float, float, float] | None = None  # the vertical of generated views; None: not known
-    budget_share: float = 1.0  # of the time budget that was asked for, which the settings have
 
 
 class Session:
@@ -187,8 +165,8 @@ class Session:
         targets = [unrounded(target) for target in self.extremes.values()]
         first, *further = [Renderer(self.backend, target) for target in targets]
         together, stepping = views_renderer(self.backend, targets), SteppingRenderer.of(self.backend, targets)
-        task = Task(self.views, self.scale, self.truth, first, self._white, self.validation, self.detail, max_splats, further, together, stepping)
-        task = replace(task, follow=Following(self.base, self.views, self.scale))
+        white, follow = self.effects.background == (1.0, 1.0, 1.0), Following(self.base, self.views, self.scale)
+        task = Task(self.views, self.scale, self.truth, first, white, self.validation, self.detail, max_splats, further, together, stepping, follow)
         keeper = StateKeeper(resume, self._fingerprint())
         if not any(target.sh_degree for target in self.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no viewer evaluates view-dependent color, so that these coefficients need no gradient
@@ -223,7 +201,7 @@ class Session:
     def _for_target(self, model: SplatModel, *, shared: bool = False) -> SplatModel:
         """A copy of a model that is rendered with the target's screen filter; `shared`: with the model's tensors, if it can have these."""
         model = getattr(model, "shared", model.copy)() if shared else model.copy()
-        model.trained = replace(model.trained, screen_filter=self.effects.screen_filter, eps2d=self.effects.eps2d)
+        model.trained = model.trained.drawn_with(self.effects)
         return model
 
     @contextmanager
@@ -247,13 +225,9 @@ class Session:
     def _has_blend_weights(self) -> bool:
         return self.has_gradients and self.base.traits.same_for_all_views
 
-    @property
-    def _white(self) -> bool:
-        return self.effects.background == (1.0, 1.0, 1.0)
-
     def _fingerprint(self) -> str:
         """A hash of everything that a run depends on, so that a state is never resumed as another run."""
-        base = self.base.digest or digest_of_parameters(self.base)
+        base = digest_of_model(self.base)
         targets = [asdict(target) for target in self.targets.values()]
         base += "" if self.finer is None else digest_of_parameters(self.finer.model)
         settings, views = self.config.model_dump(), digest_of(self.views)
@@ -276,7 +250,7 @@ class Session:
             warn(note)
         return Report(
             scale=self.scale,
-            base=self.base.digest or digest_of_parameters(self.base),
+            base=digest_of_model(self.base),
             settings=self.config.model_copy(update={"validation_views": self.asked.validation_views}),  # which a time budget bounds
             backend=self.backend_note,
             views=self.views_note,

@@ -154,10 +154,10 @@ def png(image: Tensor) -> bytes:
     return file.getvalue()
 
 
-def paletted(image: Tensor, colors: int = 256) -> tuple[np.ndarray, np.ndarray]:
-    """An image [H, W, 3] as numbers of colors, [H, W], and the at most `colors` colors, [C, 3] in 0..255; errors are spread over neighbors."""
-    quantized = Image.fromarray(_bytes(image)).quantize(colors)
-    return np.asarray(quantized), np.asarray(quantized.getpalette()).reshape(-1, 3)[:colors]
+def paletted(image: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """An image [H, W, 3] as numbers of colors, [H, W], and these colors, at most 256, [C, 3] in 0..255; errors are spread over neighbors."""
+    quantized = Image.fromarray(_bytes(image)).quantize()
+    return np.asarray(quantized), np.asarray(quantized.getpalette()).reshape(-1, 3)
 
 
 def data_uri(image: Tensor, side: int) -> str:

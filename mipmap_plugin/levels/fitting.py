@@ -16,7 +16,7 @@ from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import WRITTEN
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.models import contract
-from mipmap_plugin.models.base import SplatModel, digest_of_parameters
+from mipmap_plugin.models.base import SplatModel, digest_of_model
 from mipmap_plugin.models.mip import for_loader_of, wants_filter
 from mipmap_plugin.recipes import recipe, scale_of_fraction
 
@@ -58,7 +58,7 @@ def recorded(base: FrozenBase, requests: Sequence[tuple[float, str | None]], set
     unknown or out of range.
     """
     further = {**settings, "most_splats": len(base.model.parameters()["means"])}
-    name, digest = further.pop("recipe"), base.model.digest or digest_of_parameters(base.model)
+    name, digest = further.pop("recipe"), digest_of_model(base.model)
     made_from = {"base": digest, "inputs": base.asked, "orbit": asdict(base.orbit())}
     records = [provenance({"scale": scale, "viewer": viewer, **made_from}, recipe(name, scale, **further), versions()) for scale, viewer in requests]
     return max(records, key=lambda record: (wants_filter(record["viewer"]), len(json.dumps(record, default=str))))

@@ -14,14 +14,13 @@ from typing import Any, cast
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.report import Report, versions
 from mipmap_plugin.camera import digest_of
-from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import MipmapPluginError, SettingsError, brief
 from mipmap_plugin.formats.atomic import json_text, refuse_unwritable, settled, write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.base import Filtered, SplatModel, digest_of_parameters
+from mipmap_plugin.models.base import Filtered, SplatModel, digest_of_model
 from mipmap_plugin.models.places import REPORT, STATE, state_path
 
 # Written before the first level: what was broken off earlier leaves the state of a run at most.
@@ -84,17 +83,13 @@ class LevelStore:
             raise SettingsError(f"{file}: this level of an unfinished ladder is damaged ({brief(error)}); delete its folder to start anew") from error
         plain: SplatModel = cast(Filtered, read).bare() if read.traits.filtered else read  # the filter of a file for Mip-Splatting is 0
         model = plain.to(self._base.model.parameters()["means"].device)
-        model.trained = _trained(self._base, self._target)
+        model.trained = self._base.trained.drawn_with(self._target)
         backend, _ = self._base.backend(viewer=report.viewer)
         return Adapted(model, report, backend, self._target, {str(report.viewer): self._target}, cameras=self._base.views())
 
 
-def _trained(base: FrozenBase, target: Effects) -> Any:
-    return replace(base.trained, screen_filter=target.screen_filter, eps2d=target.eps2d)
-
-
 def _facts(base: FrozenBase, request: LadderRequest) -> dict[str, Any]:
     """Everything that the levels depend on."""
-    of_base = {"base": base.model.digest or digest_of_parameters(base.model), "trained": str(base.trained), "background": base.background}
+    of_base = {"base": digest_of_model(base.model), "trained": str(base.trained), "background": base.background}
     made_with = {"backend": base.backend(viewer=request.viewer)[0].name, "versions": versions()}
     return {**of_base, "cameras": digest_of(base.cameras), "request": request.facts(), **made_with}

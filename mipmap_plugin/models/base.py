@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Protocol
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import NEAR_PLANE, Effect
+from mipmap_plugin.effects import NEAR_PLANE, Effect, Effects
 from mipmap_plugin.errors import PluginError, ShapeError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
@@ -54,6 +54,10 @@ class TrainedScale:
     near_plane: float = NEAR_PLANE
     keeps_filter: bool = False
     up: tuple[float, float, float] | None = None
+
+    def drawn_with(self, target: Effects) -> TrainedScale:
+        """Of splats that were adapted to another screen filter."""
+        return replace(self, screen_filter=target.screen_filter, eps2d=target.eps2d)
 
 
 @dataclass(frozen=True)
@@ -231,6 +235,11 @@ def digest_of_parameters(model: SplatModel) -> str:
     for tensor in {**model.parameters(), **model.shared_parameters()}.values():
         digest.update(tensor.detach().cpu().numpy().tobytes())
     return digest.hexdigest()
+
+
+def digest_of_model(model: SplatModel) -> str:
+    """What a model is known by: the sha256 of its file, or else of its parameters."""
+    return model.digest or digest_of_parameters(model)
 
 
 def effects_of(model: SplatModel) -> list[Effect]:

@@ -13,7 +13,8 @@ from mipmap_plugin.models.columns import OPACITY_MARGIN
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.families import find_family
 from mipmap_plugin.models.family import Files
-from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
+from mipmap_plugin.models.reading import read_splats
+from mipmap_plugin.models.vanilla import VanillaModel
 
 
 def load_exchanged(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
@@ -27,7 +28,7 @@ def load_exchanged(path: str | Path, *, iteration: int | None = None) -> Vanilla
         checkpoint = detect(ply)
         if checkpoint.family != "3dgs":
             raise CheckpointError(f"{file}: its splats are of {find_family(checkpoint.family).title}, not read from this format; give its own file")
-        model = read_vanilla(replace(checkpoint, folder=None)).with_source(file)
+        model = read_splats(replace(checkpoint, folder=None), VanillaModel).with_source(file)
     largest = torch.tensor(OPACITY_MARGIN).logit().abs().item()
     model.parameters()["opacities"].clamp_(-largest, largest)  # 8-bit opacities may be 0 or 1, whose logits are infinite
     rounding = f"{EXCHANGE[kind][0]} rounds the trained values: the base is what its viewers show"

@@ -149,7 +149,7 @@ family = partial(Family, api_version=API_VERSION)
 LOADERS = "mipmap_plugin.models"
 
 BUILT_IN = (
-    family("3dgs", "3D Gaussian splatting", plain, load=f"{LOADERS}.vanilla:load_vanilla"),
+    family("3dgs", "3D Gaussian splatting", plain, load=f"{LOADERS}.reading:load_vanilla"),
     *(
         family(name, title, filtered(name), load=f"{LOADERS}.mip:load_mip", before=("2dgs",))
         for name, title in {"mip": "Mip-Splatting", "gof": "Gaussian Opacity Fields", "analytic": "Analytic-Splatting"}.items()

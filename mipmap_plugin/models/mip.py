@@ -26,7 +26,8 @@ from mipmap_plugin.models.columns import FILTER_3D as COLUMN
 from mipmap_plugin.models.detect import detect_as
 from mipmap_plugin.models.health import LARGEST, drop
 from mipmap_plugin.models.outputs import finite
-from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
+from mipmap_plugin.models.reading import read_splats
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting.viewers import find_viewer, viewers_for
 
 # Screen filter of each family, and its dilation in px² if no cfg_args gives the kernel_size.
@@ -154,7 +155,7 @@ def load_mip(path: str | Path, *, iteration: int | None = None) -> MipModel:
     Raises CheckpointError for a path that is damaged, of another family, or not a checkpoint.
     """
     checkpoint = detect_as(path, tuple(FAMILY_FILTERS), iteration=iteration)
-    splats = read_vanilla(checkpoint)
+    splats = read_splats(checkpoint, VanillaModel)
     invalid = torch.from_numpy(~((splats.extras[COLUMN] >= 0) & (splats.extras[COLUMN] <= LARGEST)))
     if invalid.all():
         raise CheckpointError(f"{checkpoint.path}: none of its {len(splats):,} splats has a valid {COLUMN}; export it again")

@@ -21,7 +21,8 @@ from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import SCALE, to_parameters
 from mipmap_plugin.models.detect import detect_as
 from mipmap_plugin.models.raw import MIN_SCALE
-from mipmap_plugin.models.vanilla import VanillaModel, read_splats
+from mipmap_plugin.models.reading import read_splats
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting.rotations import quaternion_product
 
 # Stands for the log of a third scale of 0; files do not contain it.

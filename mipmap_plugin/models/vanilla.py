@@ -17,27 +17,22 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError, ShapeError
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.glb import write_glb
-from mipmap_plugin.formats.ply import read_ply, write_ply
+from mipmap_plugin.formats.ply import write_ply
 from mipmap_plugin.formats.splat_transform import MOST_BANDS, is_glb, is_written, write_exchange
-from mipmap_plugin.formats.tags import recorded_filter, render_mode, with_tags
+from mipmap_plugin.formats.tags import with_tags
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale, Traits
-from mipmap_plugin.models.columns import FILTER_3D, extra_columns, notes_on, to_columns, to_parameters, whole_opacities
-from mipmap_plugin.models.detect import Checkpoint, detect_as
-from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposures
-from mipmap_plugin.models.health import LARGEST, without_invalid
+from mipmap_plugin.models.columns import to_columns, to_parameters
+from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
+from mipmap_plugin.models.health import LARGEST
 from mipmap_plugin.models.hosts import Capture, Host
-from mipmap_plugin.models.inria_folder import cfg_args_for, companion_notes, read_options, trained_scale, write_folder
+from mipmap_plugin.models.inria_folder import cfg_args_for, write_folder
 from mipmap_plugin.models.outputs import finite, refuse_format, refuse_parts, without_place
 from mipmap_plugin.models.raw import check, log, logit, moved, raw_parameters
 from mipmap_plugin.splatting.bands import joined, neighbors
 from mipmap_plugin.splatting.rotations import unit_quaternions
 
 Model = TypeVar("Model", bound="VanillaModel")
-
-# A fused file of Mip-Splatting has the columns of 3DGS; only its usual name tells it apart.
-FUSED = "its name says that a 3D filter is fused into it; if Mip-Splatting trained it, say so (--screen-filter mip)"
-
 
 @dataclass(frozen=True, eq=False)
 class Origin:
@@ -263,38 +258,3 @@ class VanillaModel:
 
     def _with(self: Model, parameters: dict[str, Tensor], origin: Origin | None = None) -> Model:
         return type(self)(parameters, self.trained, origin or self._origin, self.notes)
-
-
-def load_vanilla(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
-    """Load a 3DGS PLY or model folder. Splats that are not finite once activated are dropped, with a note.
-
-    Raises CheckpointError for a path that is damaged, of another family, or not a checkpoint.
-    """
-    return read_vanilla(detect_as(path, ("3dgs",), iteration=iteration))
-
-
-def read_vanilla(checkpoint: Checkpoint) -> VanillaModel:
-    """The splats of a checkpoint of 3DGS, or of a family that keeps them in the same columns. Raises CheckpointError."""
-    return read_splats(checkpoint, VanillaModel)
-
-
-def read_splats(checkpoint: Checkpoint, kind: type[Model]) -> Model:
-    """As `read_vanilla`, but as a model of class `kind`."""
-    path, folder = checkpoint.path, checkpoint.folder
-    ply = read_ply(path)
-    parameters, extras = kind.parameters_of(ply.columns, path), extra_columns(ply.columns)
-    options, notes = read_options(folder)
-    trained = trained_scale(options, ply.comments)
-    screen_filter = trained.screen_filter if recorded_filter(ply.comments) else render_mode(ply.comments)
-    origin = Origin(path, sha256(path), folder, checkpoint.iteration, ply.comments, extras, read_exposures(folder))
-    model = kind(parameters, trained, origin, [*checkpoint.notes, *ply.notes, *notes])
-    model.notes += [f"its opacities are whole numbers ({whole}), read as fractions of the largest"] if (whole := whole_opacities(ply.columns)) else []
-    del ply  # as large as the model, and no longer needed
-    has_filter = FILTER_3D in extras  # whose family knows its screen filter
-    taken_as_classic = screen_filter is None and trained.screen_filter == "classic" and not has_filter
-    model.notes += companion_notes(options, model.sh_degree, model.traits.exposures, taken_as_classic)
-    if screen_filter not in (None, "2dgs") and not has_filter:  # flat splats have a note of their own
-        model.notes.append(f"the header says that the splats are to be drawn {trained.screen_filter} ({trained.eps2d:g} px²)")
-    model.notes += notes_on(extras)
-    model.notes += [FUSED] if "fused" in path.stem and taken_as_classic else []
-    return without_invalid(model)

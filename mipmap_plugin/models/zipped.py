@@ -12,7 +12,8 @@ from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.formats.zipped import unpacked
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.families import find_family
-from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
+from mipmap_plugin.models.reading import read_splats
+from mipmap_plugin.models.vanilla import VanillaModel
 
 
 def load_zipped(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
@@ -35,7 +36,7 @@ def _load(ply: Path, file: Path) -> VanillaModel:
         raise CheckpointError(f"{file} holds a PLY of {find_family(checkpoint.family).title}; unpack it and give that")
     if "scale" in (provenance_of(read_header(ply).comments) or {}):
         raise CheckpointError(f"{file} holds a file that was adapted; unpack it, so that its scale is read too")
-    return read_vanilla(replace(checkpoint, folder=None))
+    return read_splats(replace(checkpoint, folder=None), VanillaModel)
 
 
 def _told(words: object, ply: Path, file: Path) -> str:

@@ -19,7 +19,7 @@ from mipmap_plugin.models.adapted_scale import refuse_adapted
 from mipmap_plugin.models.outputs import parts_of
 from mipmap_plugin.splatting.viewers import viewers_for
 from mipmap_plugin.tiles.folder import BASE, CUT, work_folder
-from mipmap_plugin.tiles.scene import find_splats, make_cut
+from mipmap_plugin.tiles.reading import find_splats, make_cut
 
 # What the folder's tiles belong to.
 PLAN = "plan.json"

@@ -200,7 +200,7 @@ def _save(scene: TiledScene, job: Job, files: Sequence[Path], joined: Joined) ->
         if job.target.suffix.lower() == ".ply":
             write(saved := job.target, job.overwrite)
         else:
-            trained = replace(scene.wrapped.model.trained, screen_filter=scene.target.screen_filter, eps2d=scene.target.eps2d)
+            trained = scene.wrapped.model.trained.drawn_with(scene.target)
             degree = scene.wrapped.model.gaussians(scene.wrapped.any_camera()).sh_degree
             folder, iteration = scene.checkpoint.folder, scene.checkpoint.iteration
             saved = write_folder(job.target, folder, cfg_args_for(folder, job.target, trained, degree), iteration, job.overwrite, write)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import shlex
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.amount import affordable_for
@@ -24,33 +22,23 @@ from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.errors import CheckpointError, SettingsError
-from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.ply_rows import PlyRows
-from mipmap_plugin.formats.torch_file import load_torch, save_torch
+from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.jobs.base import COLORS, Base
-from mipmap_plugin.models import Checkpoint, detect
-from mipmap_plugin.models.columns import extra_names
 from mipmap_plugin.models.exposure import read_exposures
-from mipmap_plugin.models.health import MIN_DISTRIBUTION, coarse, doubts, dropped, examine, refuse_few
 from mipmap_plugin.models.inria_folder import read_options, trained_scale
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.scenes.trajectories import Orbit
-from mipmap_plugin.tiles.cut import Tree, cut
+from mipmap_plugin.tiles.cut import Tree
 from mipmap_plugin.tiles.folder import BASE, CUT
+from mipmap_plugin.tiles.reading import find_splats
 from mipmap_plugin.tiles.slabs import Painter
-from mipmap_plugin.tiles.splats import CHUNK, Splats
-from mipmap_plugin.tiles.store import Store, write_pieces
+from mipmap_plugin.tiles.splats import Splats
+from mipmap_plugin.tiles.store import Store
 from mipmap_plugin.tiles.sweeps import Sweep, sweeps, views_of
 from mipmap_plugin.wrap import Wrapped, wrap_model
-
-# The families whose splats lie in a PLY row by row, each the same for all views.
-KINDS: dict[str, type[VanillaModel]] = {"3dgs": VanillaModel, "2dgs": SurfelModel}
-
-# Splats from which is told what the scene needs of a backend.
-SAMPLE = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,90 +49,6 @@ class Views:
     steering: Sequence[Camera]
     choosing: Sequence[Camera]
     note: str
-
-
-def find_splats(path: Path) -> tuple[Checkpoint, type[VanillaModel]]:
-    """The checkpoint at `path`, and what reads its columns. Raises CheckpointError; SettingsError for a family that cannot be cut."""
-    checkpoint = detect(path)
-    kind = KINDS.get(checkpoint.family)
-    if checkpoint.family == "exchange":
-        plain = checkpoint.path.with_name(checkpoint.path.name.split(".")[0] + "_plain.ply").name
-        remedy = f"convert it first (splat-transform {shlex.join([checkpoint.path.name, plain])}), or leave --tiles out"
-        raise SettingsError(f"{checkpoint.path}: only a plain PLY is cut into tiles; {remedy}")
-    if kind is None or checkpoint.path.suffix.lower() != ".ply":
-        raise SettingsError(
-            f"{checkpoint.path}: a checkpoint of {checkpoint.family} cannot be cut into tiles, only the PLY of 3DGS or 2DGS, whose splats are"
-            " the same for all views and stand by themselves; leave --tiles out"
-        )
-    return checkpoint, kind
-
-
-def make_cut(path: Path, tiles: int, folder: Path) -> None:
-    """Read the splats at `path` once, and leave them and their cut into cores in `folder`, as all jobs need them. Raises CheckpointError."""
-    checkpoint, kind = find_splats(path)
-    rows = PlyRows(checkpoint.path)
-    found = _Found()
-    write_pieces(folder / BASE, len(rows), (found(kind, part, rows.path) for part in _read(rows)))
-    splats = Splats.of(kind, [Store(folder / BASE)])
-    valid = torch.cat(found.valid)
-    refuse_few(~valid, checkpoint.path)
-    kept = valid.nonzero()[:, 0]
-    if len(kept) < tiles:
-        raise CheckpointError(f"{checkpoint.path} has {len(kept):,} splats, which cannot be cut into {tiles} tiles; give fewer")
-    cores, tree = cut(splats.places, kept, tiles)
-    if not found.drawn:
-        raise CheckpointError(f"{checkpoint.path}: every splat has an opacity below 1/255, so none is drawn; the training or the export failed")
-    told = found.doubts(len(rows))
-    for doubt in told:
-        warnings.warn(f"{checkpoint.path}: {doubt}", stacklevel=2)
-    told += [] if valid.all() else [dropped(~valid, "splats", "not finite once activated", checkpoint.path)]
-    degree_at = found.degree_at if found.highest >= 0 else int(kept[0])
-    sample = torch.cat([kept[:: -(-len(kept) // SAMPLE)], torch.tensor([degree_at])]).unique()
-    places = torch.where(valid[:, None], splats.places, torch.nan)  # an invalid splat is seen by no camera
-    stored = {"places": places, "cores": cores, "tree": tree, "sample": sample, "digest": sha256(checkpoint.path),
-              "extras": [name for name in rows.header.vertex.names if name in found.extras], "doubts": told}  # fmt: skip
-    save_torch(folder / CUT, stored, overwrite=True)
-
-
-def _read(rows: PlyRows) -> Iterator[dict[str, Any]]:
-    """The columns of a PLY, some rows at a time."""
-    for start in range(0, len(rows), CHUNK):
-        yield rows.columns(slice(start, start + CHUNK))
-        rows.release()
-
-
-class _Found:
-    """Which splats are finite, whether one is drawn, one that has the highest SH band that is not zero, and columns that tiles do not hold."""
-
-    def __init__(self) -> None:
-        self.valid: list[Tensor] = []
-        self.degree_at, self.highest, self.drawn = 0, -1, False
-        self.rounded, self.step = 0, 0.0  # as of `Health`; the largest step
-        self.looks: list[tuple[bool, bool]] = []  # whether scales look linear, and opacities activated, where so many splats say anything
-        self.extras: set[str] = set()
-
-    def __call__(self, kind: type[VanillaModel], columns: dict[str, Any], path: Path) -> dict[str, Tensor]:
-        """Examine the next splats, and return their raw parameters."""
-        parameters = kind.parameters_of(columns, path)
-        self.extras.update(extra_names(columns))
-        health = examine(kind(parameters))
-        valid = ~health.invalid
-        self.drawn |= health.invisible < health.splats
-        self.rounded, self.step = self.rounded + health.rounded, max(self.step, health.step)
-        used = (parameters["shN"].abs().amax(dim=2) > 0) & valid[:, None]
-        if used.any():
-            row, band = used.nonzero()[used.nonzero()[:, 1].argmax()].tolist()
-            if band > self.highest:
-                self.degree_at, self.highest = sum(map(len, self.valid)) + row, band
-        self.valid.append(valid)
-        if health.splats >= MIN_DISTRIBUTION:
-            self.looks.append((health.scales_look_linear, health.opacities_look_activated))
-        return parameters
-
-    def doubts(self, splats: int) -> list[str]:
-        """As of `Health`, of all splats."""
-        linear, activated = map(all, zip(*self.looks, strict=True)) if self.looks else (False, False)
-        return doubts(coarse(self.rounded, splats, self.step), linear, activated)
 
 
 class TiledScene:
@@ -162,7 +66,6 @@ class TiledScene:
         self.doubts: list[str] = stored["doubts"]  # about the base's splats, in sentences
         self.extras: list[str] = stored["extras"]  # columns of the base that tiles do not hold
         self.digest: str = stored["digest"]
-        self.options, _ = read_options(self.checkpoint.folder)
         self.wrapped = self._wrapped(base, stored["sample"])
         targets = self.wrapped.targets(viewer)
         self.target: Effects = next(iter(targets.values()))
@@ -171,12 +74,10 @@ class TiledScene:
 
     def _wrapped(self, base: Base, sample: Tensor) -> Wrapped:
         """Some of the splats with the cameras of all."""
-        checkpoint, options = self.checkpoint, self.options
-        comments = self.comments
-        origin = Origin(
-            checkpoint.path, self.digest, checkpoint.folder, checkpoint.iteration, comments, {}, read_exposures(checkpoint.folder)
-        )  # fmt: skip
-        trained = trained_scale(options, comments)
+        path, folder, iteration = self.checkpoint.path, self.checkpoint.folder, self.checkpoint.iteration
+        origin = Origin(path, self.digest, folder, iteration, self.comments, exposures=read_exposures(folder))
+        options, _ = read_options(folder)
+        trained = trained_scale(options, self.comments)
         if self.kind is SurfelModel:
             trained = flat_trained(trained)
         model = self.kind(self.base.parameters(sample), trained, origin)
@@ -241,8 +142,7 @@ class TiledScene:
 
     def for_target(self, parameters: dict[str, Tensor]) -> VanillaModel:
         """A model of some splats, as it is saved for the target; its parameters are leaves that require gradients."""
-        trained = replace(self.wrapped.model.trained, screen_filter=self.target.screen_filter, eps2d=self.target.eps2d)
-        return self.kind(parameters, trained).copy()
+        return self.kind(parameters, self.wrapped.model.trained.drawn_with(self.target)).copy()
 
     def painter(self, effects: Effects) -> Painter:
         """What draws splats from the disk."""

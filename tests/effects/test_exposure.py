@@ -26,7 +26,7 @@ def base(path, exposures=None):
     folder = tiny.folder(path)
     if exposures is not None:
         (folder / "exposure.json").write_text(exposures if isinstance(exposures, str) else json.dumps(exposures))
-    return wrap_model(folder, backend="reference")
+    return wrap_model(folder)
 
 
 def line(result) -> tuple[bool, str]:

@@ -180,16 +180,16 @@ IMPORTED = """
 import sys
 from mipmap_plugin import wrap_model
 model = wrap_model(sys.argv[1], backend="reference")
-model.render(model.cameras[0], outputs=sys.argv[2:])
-print("mipmap_plugin.backends.geometry" in sys.modules)
+for outputs in ([], ["depth"]):
+    model.render(model.cameras[0], outputs=outputs)
+    print("mipmap_plugin.backends.geometry" in sys.modules)
 """
 
 
-@pytest.mark.parametrize("outputs", [[], ["depth"]])
-def test_code_for_outputs_is_imported_only_for_them(tmp_path, outputs):
+def test_code_for_outputs_is_imported_only_for_them(tmp_path):
     folder = tiny.folder(tmp_path / "base", count=5)
-    done = subprocess.run([sys.executable, "-c", IMPORTED, str(folder), *outputs], capture_output=True, text=True)
-    assert (done.returncode, done.stdout.strip()) == (0, str(bool(outputs))), done.stderr
+    done = subprocess.run([sys.executable, "-c", IMPORTED, str(folder)], capture_output=True, text=True)
+    assert done.stdout.split() == ["False", "True"], done.stderr
 
 
 def test_an_adapted_model_renders_outputs_too():

@@ -33,14 +33,6 @@ WRITERS = ["ply", "cfg_args", "ply of Mip-Splatting", "checkpoints.pth", "opacit
 WRITERS += ["ckpt of gsplat", "ckpt of splatfacto"]
 
 
-@pytest.fixture(autouse=True)
-def ctrl_c_is_heard():
-    """Also where the tests run in the background, whose processes are started deaf to it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 @contextmanager
 def disk_that_holds(size: int):
     """No file may grow beyond `size` bytes; what is written behind that fails, in Python and in C++."""

@@ -25,7 +25,8 @@ from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.screen_filters import SCREEN_FILTERS
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
-PLAN = Plan(recipes=("default",), steps=(6,), backends=("reference",), supersampling=(2,), renderers=False, repeats=2)
+PLAN = Plan(recipes=("default",), steps=(6,), backends=("auto",), supersampling=(2,), renderers=False, repeats=2)
+BY_REFERENCE = replace(PLAN, backends=("reference",))
 
 
 def wrapped(views=None, backend="auto"):
@@ -113,7 +114,7 @@ def test_a_filter_that_the_backend_lacks_is_named(monkeypatch):
     few = replace(ReferenceBackend.capabilities, screen_filters=frozenset({"classic", "antialiased", "mip", "analytic"}))
     monkeypatch.setattr(ReferenceBackend, "capabilities", few)
     model = wrapped(backend="reference")
-    [note] = measuring.left_out(model, PLAN)
+    [note] = measuring.left_out(model, BY_REFERENCE)
     assert re.match(r"there is no window filter, since backend 'reference' cannot do this(, but cpu can)?: .*not window$", note)
     names = [baseline.name for baseline in measuring._baselines(model, base_itself(model, 1 / 4, 1), 1 / 4, PLAN) if baseline.kind == "filter"]
     assert names == ["scaled", "antialiased", "analytic", "mip"]
@@ -191,7 +192,7 @@ def test_measuring_is_not_billed(monkeypatch):
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     monkeypatch.setattr(ReferenceBackend, "render", lambda *scene: passes(1, draw(*scene)))
     slow = replace(yardstick, psnr=lambda *pair: passes(1000, yardstick.psnr(*pair)))
-    points = list(measure(model, slow, 1 / 4, replace(PLAN, repeats=1)))
+    points = list(measure(model, slow, 1 / 4, replace(BY_REFERENCE, repeats=1)))
     assert points[0].ms_per_frame.median == points[-1].ms_per_frame.median == 1000
     assert 6 <= points[-1].adapt_seconds.median < 1000  # its own looks at validation views are
 

@@ -14,9 +14,10 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.contents import LeftOut
 from mipmap_plugin.levels.distance.chunks import Chunks
-from mipmap_plugin.levels.distance.level import AS_FINER, LevelRun, Scene
+from mipmap_plugin.levels.distance.level import AS_FINER, LevelRun
 from mipmap_plugin.levels.distance.manifest import Contents, write
 from mipmap_plugin.levels.distance.rule import DistanceRule, is_unbounded, nearest
+from mipmap_plugin.levels.distance.scene import Scene
 from mipmap_plugin.levels.distance.walks import focal_of, foreground
 from mipmap_plugin.levels.distance.yardstick import measured
 from mipmap_plugin.levels.finished import Ladder

@@ -7,7 +7,6 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -15,46 +14,37 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint
-from mipmap_plugin.adaptation.optimization.amount import affordable_for, fewer_note
+from mipmap_plugin.adaptation.optimization.amount import fewer_note
 from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Task
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, Validation, split_validation
 from mipmap_plugin.adaptation.report import Report, filters, versions
-from mipmap_plugin.adaptation.seeing import seeing
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.compilation import warm_up
-from mipmap_plugin.adaptation.start.pixel_size import enough_views, pixel_size, seen_pixel_size
+from mipmap_plugin.adaptation.start.pixel_size import enough_views
 from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
-from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.adaptation.warn import warn
-from mipmap_plugin.backends.base import Backend, Calls
+from mipmap_plugin.backends.base import Calls
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.effects import Effects, explain
-from mipmap_plugin.frozen_base import FrozenBase
+from mipmap_plugin.effects import explain
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.levels.distance.chunks import Chunks
-from mipmap_plugin.levels.distance.coarsening import coarsened, kept_splats, shaped
+from mipmap_plugin.levels.distance.coarsening import coarsened, kept_splats
 from mipmap_plugin.levels.distance.mixture import Mixture
-from mipmap_plugin.levels.distance.rule import DistanceRule, nearest
-from mipmap_plugin.levels.distance.walks import WalkTruth, backed, focal_of, foreground
-from mipmap_plugin.levels.request import MERGING_COSTS, LadderRequest
-from mipmap_plugin.models.base import SplatModel, digest_of_parameters, effects_of
+from mipmap_plugin.levels.distance.scene import Scene
+from mipmap_plugin.levels.distance.walks import WalkTruth
+from mipmap_plugin.levels.request import MERGING_COSTS
+from mipmap_plugin.models.base import SplatModel, digest_of_model, digest_of_parameters, effects_of
 from mipmap_plugin.models.contract import rebuild
 from mipmap_plugin.models.health import doubts_in
 from mipmap_plugin.process.clock import now
 from mipmap_plugin.progress import announced
-from mipmap_plugin.recipes import recipe as make_config
-from mipmap_plugin.scenes.trajectories import GOLDEN
 
-# Samples of the truth per pixel along each side, to adapt to and to measure by. In walks over flowers, three agree with six to 67 dB.
-SAMPLES, MEASURED_SAMPLES = 2, 3
-
-# The settings of a zoom-out end here; at x1 nothing would be merged.
-BELOW_1 = 1 - 1e-3
+# Samples of the truth per pixel along each side.
+SAMPLES = 2
 
 # The finer level, of which a level is made, and which it replaces farther away.
 AS_FINER = "the finer level as it is"
@@ -71,67 +61,6 @@ class WalkTask(Task):
 
     def pixel(self, means: Tensor) -> float:
         return self.size
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """What all levels of a ladder by distance share."""
-
-    base: FrozenBase
-    request: LadderRequest
-    rule: DistanceRule
-    chunks: Chunks
-    extent: int  # world units, of a chunk
-    target: Effects
-    backend: Backend
-    note: str  # which backend, and why
-
-    @cached_property
-    def splats(self) -> Gaussians:
-        """The base's own."""
-        return self.base.model.gaussians(self.base.any_camera()).detach()
-
-    @cached_property
-    def views(self) -> list[Camera]:
-        """Those of the training that see something."""
-        return seeing(self.base.views(), self.splats.means, self.target.near_plane)
-
-    def pixel_of(self, means: Tensor) -> Tensor:
-        return pixel_size(means, self.views)
-
-    @cached_property
-    def near(self) -> float:
-        """The size of a pixel of the training at the nearest parts of the scene that are seen, in world units."""
-        return nearest(seen_pixel_size(self.splats.means, self.views, self.base.effects().near_plane))
-
-    def scale(self, level: int) -> float:
-        """The scale of a level at the nearest parts of the scene."""
-        return min(1.0, self.near / self.rule.middle(level)) if level else 1.0
-
-    def config(self, level: int) -> AdaptConfig:
-        """The settings of a level. Rows stay what they are, because those of the finer level come first."""
-        config = affordable_for(self.asked(level), self.splats.means, self.views, self.target.near_plane)
-        return fitting(config, self.base.effects()).model_copy(update={"prune_every": max(1, config.steps)})
-
-    def asked(self, level: int) -> AdaptConfig:
-        """The settings of a level in a scene of any size."""
-        return make_config(self.request.recipe, min(BELOW_1, self.scale(level)), merge_to=1.0, **self.request.settings)
-
-    def unmade(self, finest: Gaussians, level: int) -> Gaussians:
-        """A level that is not made yet, in closed form."""
-        size = self.rule.middle(level)
-        scales, opacities = shaped(finest, self.pixel_of(finest.means).clamp_max(size), size, self.target)
-        changes = self.pixel_of(finest.means) < size
-        scales, opacities = torch.where(changes[:, None], scales, finest.scales), torch.where(changes, opacities, finest.opacities)
-        return replace(finest, scales=scales, opacities=opacities)
-
-    def walked(self, view: Camera, level: int, number: int) -> Camera:
-        """The view from as far back as the level is seen from: of one in three views anywhere up to there, of the others right there."""
-        low, high = self.rule.ends(level)
-        size = low * (high / low) ** ((number + 0.5) * GOLDEN % 1)
-        way = max(0.0, size * focal_of(view) - foreground(view, self.splats.means, self.target.near_plane))
-        part = (number + 0.5) * GOLDEN**2 % 1 if number % 3 == 0 else 1.0
-        return backed(view, part * way if math.isfinite(way) else 0.0)
 
 
 @dataclass(eq=False)
@@ -159,7 +88,7 @@ class LevelRun:
         self.views, steering, choosing = walked(views), walked(held_out[::2]), walked(held_out[1::2])
         self.views_note = f"{note}, each from as far back as this level is seen from"
         truth = WalkTruth((scene.splats, scene.backend, scene.base.effects()), scene.views, begins, SAMPLES)
-        finest = [each.gaussians(scene.base.any_camera()).detach() for each in self.finer]
+        finest = [scene.splats_of(each) for each in self.finer]
         coming = [scene.unmade(finest[0], level) for level in range(self.number + 1, scene.rule.count)]
         self.finest, self.others = finest[-1], (finest, coming)
         self.unmerged = Mixture.of(scene.rule, scene.chunks, [*finest, finest[-1], *coming])
@@ -236,8 +165,8 @@ class LevelRun:
 
     def _for_target(self) -> SplatModel:
         """A copy of the finer level that is rendered with the target's screen filter."""
-        student, target = self.finer[-1].copy(), self.scene.target
-        student.trained = replace(student.trained, screen_filter=target.screen_filter, eps2d=target.eps2d)
+        student = self.finer[-1].copy()
+        student.trained = student.trained.drawn_with(self.scene.target)
         return student
 
     def _coarser(self, weights: Tensor | None, kept: int) -> SplatModel:
@@ -251,13 +180,13 @@ class LevelRun:
 
         with torch.no_grad():
             rebuild(student, form)
-            made, coming = student.gaussians(scene.base.any_camera()).detach(), self.others[1]
+            made, coming = scene.splats_of(student), self.others[1]
             self.mixture = Mixture.of(scene.rule, scene.chunks, [*self.others[0], made, *coming])
         return student
 
     def _fingerprint(self) -> str:
         scene = self.scene
-        base = scene.base.model.digest or digest_of_parameters(scene.base.model)
+        base = digest_of_model(scene.base.model)
         facts = [base, self.number, self.config.model_dump(), scene.backend.name, asdict(scene.target), asdict(scene.rule)]
         return hashlib.sha256(json.dumps([*facts, *map(digest_of_parameters, self.finer), digest_of(self.views)]).encode()).hexdigest()
 
@@ -265,7 +194,7 @@ class LevelRun:
         scene, effects = self.scene, self.scene.base.effects()
         return Report(
             scale=scene.scale(self.number),
-            base=scene.base.model.digest or digest_of_parameters(scene.base.model),
+            base=digest_of_model(scene.base.model),
             settings=self.config,
             backend=scene.note,
             views=self.views_note,
@@ -273,7 +202,7 @@ class LevelRun:
             filters=filters(1.0, self.config, effects, [scene.target]),
             effects=explain(scene.target, scene.splats, effects_of(scene.base.model), self.config, 1.0),
             gaussians_before=len(scene.splats),
-            gaussians_after=len(student.gaussians(scene.base.any_camera())),
+            gaussians_after=len(scene.splats_of(student)),
             seconds=self.seconds,
             ended_by=ended_by + fewer_note(scene.asked(self.number).steps, self.config),
             returned=best,

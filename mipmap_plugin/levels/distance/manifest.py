@@ -11,7 +11,7 @@ from typing import Any
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.formats.atomic import new_folder, sha256, write_json
 from mipmap_plugin.levels.contents import LeftOut
-from mipmap_plugin.levels.distance.level import Scene
+from mipmap_plugin.levels.distance.scene import Scene
 from mipmap_plugin.levels.distance.yardstick import TRUTH, WalkPoint
 from mipmap_plugin.levels.manifest import FORMAT, MANIFEST, level_name, refuse_ladder
 

@@ -19,7 +19,8 @@ from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.moving.memory import Changes
 from mipmap_plugin.models.moving.model import MovingModel, read_canonical
 from mipmap_plugin.models.places import is_coarse
-from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
+from mipmap_plugin.models.reading import read_splats
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting.rotations import quaternion_product
 
 NET = "deformation_net."  # prefix of the names of all weights in use
@@ -166,7 +167,7 @@ def load_hexplane(path: str | Path, *, iteration: int | None = None) -> MovingMo
     """Load a model folder of 4D Gaussians; a PLY of its coarse stage, in which nothing moves, is plain 3DGS. Raises CheckpointError."""
     checkpoint = detect(path, iteration=iteration)
     if checkpoint.family == "4dgs" and is_coarse(checkpoint.path):
-        model = read_vanilla(checkpoint)
+        model = read_splats(checkpoint, VanillaModel)
         model.notes.append("it is of the coarse stage of 4D Gaussians, in which nothing moves yet")
         return model
     canonical, network = read_canonical(path, iteration, "4dgs")

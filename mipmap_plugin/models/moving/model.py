@@ -22,7 +22,8 @@ from mipmap_plugin.models.detect import detect_as
 from mipmap_plugin.models.families import find_family
 from mipmap_plugin.models.moving.memory import Changes, Memory
 from mipmap_plugin.models.places import network_of
-from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
+from mipmap_plugin.models.reading import read_splats
+from mipmap_plugin.models.vanilla import VanillaModel
 
 # Number of views at whose times opacities are evaluated; each costs one pass through the field.
 ENOUGH_MOMENTS = 8
@@ -226,7 +227,7 @@ def moved_to(field: Field, canonical: VanillaModel, time: float) -> Gaussians:
 def read_canonical(path: str | Path, iteration: int | None, family: str) -> tuple[VanillaModel, Path]:
     """The canonical splats of a moving scene, and the file of their network. Raises CheckpointError."""
     checkpoint = detect_as(path, (family,), iteration=iteration)
-    canonical = read_vanilla(checkpoint)
+    canonical = read_splats(checkpoint, VanillaModel)
     title = find_family(family).title
     canonical.notes += [f"the network that moves the splats ({title}) is frozen: they adapt as they are before they move", TIMELESS]
     return canonical, network_of(checkpoint.path, family)

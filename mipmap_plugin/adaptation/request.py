@@ -1,0 +1,34 @@
+"""What is asked of an adaptation, beside its scale and its settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from mipmap_plugin.adaptation.start.problem import FinerLevel
+from mipmap_plugin.adaptation.target.base_images import BaseImages
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.models.base import SplatModel
+
+# (step, seconds of adapting so far, function that renders a camera of the new scale with the current model, without gradients)
+# -> True (Python's, NumPy's or torch's) to end the run with this step, and anything else to go on. Its time is not counted.
+Observer = Callable[[int, float, Callable[[Camera], Tensor]], object]
+
+
+@dataclass(frozen=True)
+class AdaptationRequest:
+    """What is adapted, for which viewers, and by which backend."""
+
+    images: BaseImages  # of the model, rendered as in its training, by the backend
+    targets: Mapping[str, Effects]  # how the adapted file is rendered, by viewer; the file names the first of them
+    viewer: str | None  # the viewer (or group of viewers) that the file is made for; None: what draws as the training did
+    backend_note: str  # which backend was chosen, and why
+    has_gradients: bool  # whether the backend has gradients for this request
+    base_in_viewer: SplatModel  # what the viewer reads of the base's own file: mostly the base itself
+    finer: FinerLevel | None = None  # what the run starts from instead of the base
+    inputs: Mapping[str, str] = field(default_factory=dict)  # `Report.inputs`
+    up: tuple[float, float, float] | None = None  # the vertical of generated views; None: not known
+    budget_share: float = 1.0  # of the time budget that was asked for, which the settings have

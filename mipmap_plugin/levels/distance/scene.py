@@ -1,0 +1,97 @@
+"""What all levels of a ladder by distance share: the base, the rule, the chunks, and what follows from them for each level."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.adaptation.optimization.amount import affordable_for
+from mipmap_plugin.adaptation.seeing import seeing
+from mipmap_plugin.adaptation.start.pixel_size import pixel_size, seen_pixel_size
+from mipmap_plugin.adaptation.target.resize import fitting
+from mipmap_plugin.backends.base import Backend
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.frozen_base import FrozenBase
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.levels.distance.chunks import Chunks
+from mipmap_plugin.levels.distance.coarsening import shaped
+from mipmap_plugin.levels.distance.rule import DistanceRule, nearest
+from mipmap_plugin.levels.distance.walks import backed, focal_of, foreground
+from mipmap_plugin.levels.request import LadderRequest
+from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.recipes import recipe as make_config
+from mipmap_plugin.scenes.trajectories import GOLDEN
+
+# The settings of a zoom-out end here; at x1 nothing would be merged.
+BELOW_1 = 1 - 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What all levels of a ladder by distance share."""
+
+    base: FrozenBase
+    request: LadderRequest
+    rule: DistanceRule
+    chunks: Chunks
+    extent: int  # world units, of a chunk
+    target: Effects
+    backend: Backend
+    note: str  # which backend, and why
+
+    @cached_property
+    def splats(self) -> Gaussians:
+        """The base's own."""
+        return self.splats_of(self.base.model)
+
+    def splats_of(self, model: SplatModel) -> Gaussians:
+        """Those of a level, without gradients."""
+        return model.gaussians(self.base.any_camera()).detach()
+
+    @cached_property
+    def views(self) -> list[Camera]:
+        """Those of the training that see something."""
+        return seeing(self.base.views(), self.splats.means, self.target.near_plane)
+
+    def pixel_of(self, means: Tensor) -> Tensor:
+        return pixel_size(means, self.views)
+
+    @cached_property
+    def near(self) -> float:
+        """The size of a pixel of the training at the nearest parts of the scene that are seen, in world units."""
+        return nearest(seen_pixel_size(self.splats.means, self.views, self.base.effects().near_plane))
+
+    def scale(self, level: int) -> float:
+        """The scale of a level at the nearest parts of the scene."""
+        return min(1.0, self.near / self.rule.middle(level)) if level else 1.0
+
+    def config(self, level: int) -> AdaptConfig:
+        """The settings of a level. Rows stay what they are, because those of the finer level come first."""
+        config = affordable_for(self.asked(level), self.splats.means, self.views, self.target.near_plane)
+        return fitting(config, self.base.effects()).model_copy(update={"prune_every": max(1, config.steps)})
+
+    def asked(self, level: int) -> AdaptConfig:
+        """The settings of a level in a scene of any size."""
+        return make_config(self.request.recipe, min(BELOW_1, self.scale(level)), merge_to=1.0, **self.request.settings)
+
+    def unmade(self, finest: Gaussians, level: int) -> Gaussians:
+        """A level that is not made yet, in closed form."""
+        size = self.rule.middle(level)
+        scales, opacities = shaped(finest, self.pixel_of(finest.means).clamp_max(size), size, self.target)
+        changes = self.pixel_of(finest.means) < size
+        scales, opacities = torch.where(changes[:, None], scales, finest.scales), torch.where(changes, opacities, finest.opacities)
+        return replace(finest, scales=scales, opacities=opacities)
+
+    def walked(self, view: Camera, level: int, number: int) -> Camera:
+        """The view from as far back as the level is seen from: of one in three views anywhere up to there, of the others right there."""
+        low, high = self.rule.ends(level)
+        size = low * (high / low) ** ((number + 0.5) * GOLDEN % 1)
+        way = max(0.0, size * focal_of(view) - foreground(view, self.splats.means, self.target.near_plane))
+        part = (number + 0.5) * GOLDEN**2 % 1 if number % 3 == 0 else 1.0
+        return backed(view, part * way if math.isfinite(way) else 0.0)

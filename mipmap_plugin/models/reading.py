@@ -1,0 +1,48 @@
+"""Splats read from a PLY of 3DGS, or of a family with the same columns, with what its header and the model folder around it say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mipmap_plugin.formats.atomic import sha256
+from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.formats.tags import recorded_filter, render_mode
+from mipmap_plugin.models.columns import FILTER_3D, extra_columns, notes_on, whole_opacities
+from mipmap_plugin.models.detect import Checkpoint, detect_as
+from mipmap_plugin.models.exposure import read_exposures
+from mipmap_plugin.models.health import without_invalid
+from mipmap_plugin.models.inria_folder import companion_notes, read_options, trained_scale
+from mipmap_plugin.models.vanilla import Model, Origin, VanillaModel
+
+# A fused file of Mip-Splatting has the columns of 3DGS; only its usual name tells it apart.
+FUSED = "its name says that a 3D filter is fused into it; if Mip-Splatting trained it, say so (--screen-filter mip)"
+
+
+def load_vanilla(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
+    """Load a 3DGS PLY or model folder. Splats that are not finite once activated are dropped, with a note.
+
+    Raises CheckpointError for a path that is damaged, of another family, or not a checkpoint.
+    """
+    return read_splats(detect_as(path, ("3dgs",), iteration=iteration), VanillaModel)
+
+
+def read_splats(checkpoint: Checkpoint, kind: type[Model]) -> Model:
+    """The splats of a checkpoint of 3DGS, or of a family that keeps them in the same columns, as a model of class `kind`. Raises CheckpointError."""
+    path, folder = checkpoint.path, checkpoint.folder
+    ply = read_ply(path)
+    parameters, extras = kind.parameters_of(ply.columns, path), extra_columns(ply.columns)
+    options, notes = read_options(folder)
+    trained = trained_scale(options, ply.comments)
+    screen_filter = trained.screen_filter if recorded_filter(ply.comments) else render_mode(ply.comments)
+    origin = Origin(path, sha256(path), folder, checkpoint.iteration, ply.comments, extras, read_exposures(folder))
+    model = kind(parameters, trained, origin, [*checkpoint.notes, *ply.notes, *notes])
+    model.notes += [f"its opacities are whole numbers ({whole}), read as fractions of the largest"] if (whole := whole_opacities(ply.columns)) else []
+    del ply  # as large as the model, and no longer needed
+    has_filter = FILTER_3D in extras  # whose family knows its screen filter
+    taken_as_classic = screen_filter is None and trained.screen_filter == "classic" and not has_filter
+    model.notes += companion_notes(options, model.sh_degree, model.traits.exposures, taken_as_classic)
+    if screen_filter not in (None, "2dgs") and not has_filter:  # flat splats have a note of their own
+        model.notes.append(f"the header says that the splats are to be drawn {trained.screen_filter} ({trained.eps2d:g} px²)")
+    model.notes += notes_on(extras)
+    model.notes += [FUSED] if "fused" in path.stem and taken_as_classic else []
+    return without_invalid(model)
