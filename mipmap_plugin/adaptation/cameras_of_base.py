@@ -10,16 +10,19 @@ from mipmap_plugin.errors import MipmapPluginError, is_temporary
 from mipmap_plugin.models.adapted_scale import report_beside
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.zipped_folder import opened, told
-from mipmap_plugin.scenes import Scene, load_scene, model_cameras
+from mipmap_plugin.scenes import Scene, cameras_in, load_scene, model_cameras
 
 # What is said where the cameras are gone, or are others by now.
 GONE = "views of a generated orbit are taken instead; give the scene's cameras (--cameras)"
 
 
 def own_cameras(source: Path | None, folder: Path | None) -> tuple[list[Camera] | Scene, dict[str, str]]:
-    """The cameras beside the file `source` of a model in `folder`, or those of the base that it was adapted from; and `where` they were read from."""
-    beside = model_cameras(folder, read_options(folder)[0])
-    return (beside, where(None, folder)) if beside else _of_base(source) or ([], {})
+    """The cameras beside the file `source` of a model in `folder`, in it, or of the base that it was adapted from; and `where` they were found."""
+    if beside := model_cameras(folder, read_options(folder)[0]):
+        return beside, where(None, folder)
+    if inside := cameras_in(source):
+        return inside, where(source, None)
+    return _of_base(source) or ([], {})
 
 
 def where(scene: Path | None, folder: Path | None) -> dict[str, str]:

@@ -46,11 +46,12 @@ def wrap(base: Base, threads: int | None = None) -> Wrapped:
 
 
 def base_cameras(wrapped: Wrapped, given: Path | None) -> str:
-    """Where the cameras of an adapted file's base were found; "" if they lay beside the file, or were `given`."""
+    """Where the cameras of an adapted file's base were found; "" if they lay beside the file, or in it, or were `given`."""
     from mipmap_plugin.models.zipped_folder import told
 
     place = wrapped.cameras_from.get("scene", "")
-    return "" if given is not None or place == told(wrapped.model.folder and wrapped.model.folder.absolute()) else place
+    own = [told(path.absolute()) for path in (wrapped.model.folder, wrapped.model.source) if path is not None]
+    return "" if given is not None or place in own else place
 
 
 def scene(path: Path) -> Scene:

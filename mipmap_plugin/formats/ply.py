@@ -70,9 +70,8 @@ class Header:
     def vertex(self) -> Element:
         return next(element for element in self.elements if element.name == "vertex")
 
-    @property
-    def before_vertex(self) -> tuple[Element, ...]:
-        return self.elements[: self.elements.index(self.vertex)]
+    def before(self, element: Element) -> tuple[Element, ...]:
+        return self.elements[: self.elements.index(element)]
 
     def least_bytes(self, element: Element) -> int:
         """The least number of bytes of a row; in ascii, a digit and a blank per value."""
@@ -109,13 +108,16 @@ def read_ply(path: str | Path) -> PlyFile:
     """The rows of a PLY in ascii or either byte order, with any extra elements and column order. Raises CheckpointError."""
     path = Path(path)
     header = read_header(path)
-    vertex = header.vertex
-    if header.format == "ascii" or any(element.has_lists for element in header.before_vertex):
-        rows = _read_through_plyfile(path, header)
-    else:
-        start = header.body + sum(element.count * element.stride for element in header.before_vertex)
-        rows = np.fromfile(path, vertex.dtype(BYTE_ORDER[header.format]), vertex.count, offset=start)
-    return PlyFile({name: rows[name] for name in vertex.names}, header.comments, header.format, header.notes)
+    rows = read_element(path, header, header.vertex)
+    return PlyFile({name: rows[name] for name in header.vertex.names}, header.comments, header.format, header.notes)
+
+
+def read_element(path: Path, header: Header, element: Element) -> np.ndarray:
+    """The rows of an element of a PLY with this header. Raises CheckpointError."""
+    if header.format == "ascii" or any(other.has_lists for other in header.before(element)):
+        return _read_through_plyfile(path, header, element)
+    start = header.body + sum(other.count * other.stride for other in header.before(element))
+    return np.fromfile(path, element.dtype(BYTE_ORDER[header.format]), element.count, offset=start)
 
 
 def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Iterable[str] = (), *, overwrite: bool = False) -> Path:
@@ -208,7 +210,7 @@ def _sized(path: Path, header: Header, size: int) -> Header:
     if vertex.has_lists:
         raise CheckpointError(f"{path} has list properties in its vertex element, so it is a mesh or another format; give a trained model")
     available = size + (header.format == "ascii")  # the last value needs no blank behind it
-    taken = sum(element.count * header.least_bytes(element) for element in header.before_vertex)
+    taken = sum(element.count * header.least_bytes(element) for element in header.before(header.vertex))
     held = max(0, available - taken) // header.least_bytes(vertex)
     if held < vertex.count:
         raise CheckpointError(
@@ -233,18 +235,18 @@ def _with_surplus(path: Path, header: Header, surplus: int) -> Header:
     return replace(header, notes=(f"{path.name} has {surplus:,} bytes more than its header declares; they are ignored",))
 
 
-def _read_through_plyfile(path: Path, header: Header) -> np.ndarray:
+def _read_through_plyfile(path: Path, header: Header, wanted: Element) -> np.ndarray:
     """Rows of varying length, parsed by plyfile with a normalized header."""
     declared = [f"ply\nformat {header.format} 1.0\n"]
     for element in header.elements:
         declared += [f"element {element.name} {element.count}\n", *(f"property {kind} {name}\n" for name, kind in element.properties)]
-        if element is header.vertex:
+        if element is wanted:
             break
     with path.open("rb") as file:
         file.seek(header.body)
         content = "".join([*declared, "end_header\n"]).encode() + file.read()
     try:
-        rows: np.ndarray = PlyData.read(io.BytesIO(content))["vertex"].data
+        rows: np.ndarray = PlyData.read(io.BytesIO(content))[wanted.name].data
         return rows
     except (PlyParseError, ValueError, OverflowError) as error:
         raise CheckpointError(f"{path} is damaged or truncated ({error}); download or export it again") from error

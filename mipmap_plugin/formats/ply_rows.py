@@ -42,9 +42,9 @@ class PlyRows:
 
 def body_of(path: Path, header: Header) -> int:
     """Bytes before the first vertex row. Raises CheckpointError if that is not known from the header."""
-    if header.format == "ascii" or any(element.has_lists for element in header.before_vertex):
+    if header.format == "ascii" or any(element.has_lists for element in header.before(header.vertex)):
         raise CheckpointError(f"{path}: only a binary PLY is read part by part; save it as one, or adapt it without tiles")
-    return header.body + sum(element.count * element.stride for element in header.before_vertex)
+    return header.body + sum(element.count * element.stride for element in header.before(header.vertex))
 
 
 def concatenate(files: Iterable[Path], comments: Iterable[str], out: IO[bytes]) -> int:

@@ -12,6 +12,7 @@ from mipmap_plugin.limits import path_of
 from mipmap_plugin.scenes.base import Scene
 from mipmap_plugin.scenes.cameras_json import read_cameras, write_cameras
 from mipmap_plugin.scenes.colmap import is_colmap, read_colmap
+from mipmap_plugin.scenes.in_ply import cameras_in
 from mipmap_plugin.scenes.moving import is_dynerf, is_hypernerf, read_dynerf, read_hypernerf
 from mipmap_plugin.scenes.trajectories import jittered, orbit
 from mipmap_plugin.scenes.transforms import read_transforms
@@ -20,7 +21,8 @@ from mipmap_plugin.scenes.transforms import read_transforms
 COLMAP_FILES = {f"{name}{suffix}" for name in ("cameras", "images", "points3D", "frames", "rigs") for suffix in (".bin", ".txt")}
 
 __all__ = [
-    "Scene", "jittered", "load_scene", "model_cameras", "orbit", "read_cameras", "read_colmap", "read_transforms", "unread_cameras", "write_cameras",
+    "Scene", "cameras_in", "jittered", "load_scene", "model_cameras", "orbit", "read_cameras", "read_colmap", "read_transforms", "unread_cameras",
+    "write_cameras",
 ]  # fmt: skip
 
 
@@ -67,7 +69,9 @@ def unread_cameras(source: Path | None) -> Path | None:
 
 
 def _of_file(path: Path, cfg: dict[str, Any] | None) -> Scene:
-    """The scene of one file: with frames it is a transforms file, whatever its name, else a cameras.json. Raises SceneError."""
+    """The scene of one file: a PLY with a camera; with frames a transforms file, whatever its name, else a cameras.json. Raises SceneError."""
+    if cameras := cameras_in(path):
+        return Scene(tuple(cameras), {}, path, [])
     if path.suffix.lower() != ".json":
         there = f"; give its folder, {path.parent}" if path.name in COLMAP_FILES else "; export them as one of these"
         raise SceneError(f"{path}: is no file of cameras that is read here (cameras.json, a transforms.json, or the folder of a COLMAP model){there}")

@@ -21,13 +21,13 @@ from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.adaptation.parallel import max_threads, together
 from mipmap_plugin.adaptation.renderers import Renderer
 from mipmap_plugin.adaptation.target.resize import difference_from
-from mipmap_plugin.adaptation.views import choose_views
+from mipmap_plugin.adaptation.views import choose_views, orbit_around
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.process.threads import side_by_side
-from mipmap_plugin.scenes.trajectories import Orbit, jittered
+from mipmap_plugin.scenes.trajectories import Orbit, jittered, with_company
 
 # At most one in this many of the given cameras is kept for validation, where the policy leaves the choice of views to us.
 VALIDATION_EVERY = 16
@@ -209,7 +209,8 @@ def _validation_views(
     if config.views in ("train", "jittered"):
         kept = evenly(originals[VALIDATION_EVERY // 2 :], min(count // 2, len(originals) // VALIDATION_EVERY))
     adapted = [view for view in views if view not in set(kept)]
-    random = jittered(originals or list(views), count - len(kept), generator, spread=False)
+    known = with_company(originals or list(views), orbit_around(around))
+    random = jittered(known, count - len(kept), generator, spread=False)
     return adapted, [view for pair in zip(random, kept, strict=False) for view in pair] + random[len(kept) :]
 
 

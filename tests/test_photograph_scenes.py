@@ -1,0 +1,57 @@
+"""Scenes that SHARP makes of one photograph: their PLY has the camera in it."""
+
+import json
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from plyfile import PlyData, PlyElement
+
+from mipmap_plugin import wrap_model
+from mipmap_plugin.errors import SceneError
+from mipmap_plugin.scenes import cameras_in, load_scene
+from mipmap_plugin.scenes.trajectories import SWAY, Orbit, with_company
+
+INTRINSIC = (40.0, 0.0, 16.0, 0.0, 40.0, 12.0, 0.0, 0.0, 1.0)
+EXTRINSIC = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]])  # the splats lie around the origin
+
+
+def sharp(path, intrinsic=INTRINSIC, *, text=False):
+    """A PLY as SHARP writes it, of the tiny splats."""
+    more = {"extrinsic": np.float32(EXTRINSIC.flatten()), "intrinsic": np.float32(intrinsic), "image_size": np.uint32([32, 24])}
+    elements = [PlyElement.describe(values.view([(name, values.dtype)]), name) for name, values in more.items()]
+    PlyData([PlyData.read(tiny.ply(path.with_suffix(".plain.ply")))["vertex"], *elements], text=text).write(path)
+    return path
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_the_camera_is_that_of_the_photograph(tmp_path, text):
+    [camera] = wrap_model(sharp(tmp_path / "photo.ply", text=text)).cameras
+    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (32, 24, 40, 40, 16, 12)
+    assert torch.equal(camera.viewmat, EXTRINSIC.double())
+    assert [each.fx for each in load_scene(tmp_path / "photo.ply").cameras] == [40.0]
+
+
+def test_the_adapted_file_is_seen_from_there_too(tmp_path):
+    adapted = wrap_model(sharp(tmp_path / "photo.ply")).adapt(1 / 2, steps=1, extra_views=3)
+    saved = adapted.save(tmp_path / "half.ply")
+    assert "1 train views and 3 around them" in json.loads((tmp_path / "half.ply.adaptation.json").read_text())["views"]
+    [camera] = wrap_model(saved).cameras
+    assert camera.fx == 40.0
+
+
+def test_a_camera_that_is_none_is_refused_and_other_elements_are_none(tmp_path):
+    with pytest.raises(SceneError, match=r"photo.ply: the camera in it is none: .* focal lengths must be positive .*; give others \(--cameras\)"):
+        wrap_model(sharp(tmp_path / "photo.ply", (0.0, *INTRINSIC[1:])))
+    others = sharp(tmp_path / "other.ply", (40.0, 40.0)), tmp_path / "other.plain.ply", tmp_path / "none.ply"
+    assert [cameras_in(other) for other in others] == [[], [], []]
+
+
+def test_views_around_a_lone_camera_move_sideways():
+    lone, orbit = tiny.cameras(1), Orbit((0.0, 0.0, 0.0), None, 1.0)
+    distance = lone[0].center.norm()
+    moved = torch.stack([each.center - lone[0].center for each in with_company(lone, orbit)[1:]])
+    torch.testing.assert_close(moved.norm(dim=1), (SWAY * distance).expand(4))
+    assert (moved @ lone[0].viewmat[2, :3]).abs().max() < 1e-9 and moved.sum(0).abs().max() < 1e-9
+    assert with_company(tiny.cameras(2), orbit)[0].name == tiny.cameras(2)[0].name and len(with_company(tiny.cameras(2), orbit)) == 2
