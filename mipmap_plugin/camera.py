@@ -79,7 +79,9 @@ class Camera:
 
         `others`: further attributes, such as `name`. Raises SettingsError, ShapeError.
         """
-        (fx, skew, cx), (zero, fy, cy) = _matrix("K", K, (3, 3)).tolist()[:2]
+        (fx, skew, cx), (zero, fy, cy), last = _matrix("K", K, (3, 3)).tolist()
+        if last != [0, 0, 1]:
+            raise SettingsError(f"K: the last row must be 0 0 1, got {' '.join(f'{number:g}' for number in last)}; it may have to be transposed")
         if skew or zero:
             raise SettingsError(f"K: a pinhole has no skew, got {skew or zero:g} beside the focal lengths; leave it out")
         return cls(width, height, fx, fy, cx, cy, viewmat, **others)
