@@ -17,9 +17,10 @@ INTRINSIC = (40.0, 0.0, 16.0, 0.0, 40.0, 12.0, 0.0, 0.0, 1.0)
 EXTRINSIC = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]])  # the splats lie around the origin
 
 
-def sharp(path, intrinsic=INTRINSIC, *, text=False):
+def sharp(path, intrinsic=INTRINSIC, size=(32, 24), *, text=False):
     """A PLY as SHARP writes it, of the tiny splats."""
-    more = {"extrinsic": np.float32(EXTRINSIC.flatten()), "intrinsic": np.float32(intrinsic), "image_size": np.uint32([32, 24])}
+    sizes = np.float32(size) if isinstance(size[0], float) else np.uint32(size)
+    more = {"extrinsic": np.float32(EXTRINSIC.flatten()), "intrinsic": np.float32(intrinsic), "image_size": sizes}
     elements = [PlyElement.describe(values.view([(name, values.dtype)]), name) for name, values in more.items()]
     PlyData([PlyData.read(tiny.ply(path.with_suffix(".plain.ply")))["vertex"], *elements], text=text).write(path)
     return path
@@ -44,8 +45,31 @@ def test_the_adapted_file_is_seen_from_there_too(tmp_path):
 def test_a_camera_that_is_none_is_refused_and_other_elements_are_none(tmp_path):
     with pytest.raises(SceneError, match=r"photo.ply: the camera in it is none: .* focal lengths must be positive .*; give others \(--cameras\)"):
         wrap_model(sharp(tmp_path / "photo.ply", (0.0, *INTRINSIC[1:])))
+    with pytest.raises(SceneError, match="the camera in it is none: .* width must be a whole number, got nan"):
+        wrap_model(sharp(tmp_path / "size.ply", size=(np.nan, 24.0)))
     others = sharp(tmp_path / "other.ply", (40.0, 40.0)), tmp_path / "other.plain.ply", tmp_path / "none.ply"
     assert [cameras_in(other) for other in others] == [[], [], []]
+
+
+@pytest.mark.parametrize(
+    ("declared", "hostile"),
+    [(b"intrinsic 9\n", b"intrinsic 900000000000000000\n"), (b"property float intrinsic", b"property list uchar float intrinsic")],
+)
+def test_elements_that_are_no_camera_are_no_camera(tmp_path, declared, hostile):
+    file = sharp(tmp_path / "photo.ply")
+    file.write_bytes(file.read_bytes().replace(declared, hostile))
+    assert cameras_in(file) == []
+
+
+def test_a_camera_that_is_cut_off_is_told_of(tmp_path):
+    file = sharp(tmp_path / "photo.ply")
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-1])
+    with pytest.raises(SceneError, match="is truncated: it ends before its element 'image_size' does"):
+        wrap_model(file)
+    file.write_bytes(whole.replace(b"element intrinsic", b"element other 900000000000000000\nproperty float other\nelement intrinsic"))
+    with pytest.raises(SceneError, match="is truncated"):
+        cameras_in(file)
 
 
 def test_views_around_a_lone_camera_move_sideways():

@@ -113,7 +113,10 @@ def read_ply(path: str | Path) -> PlyFile:
 
 
 def read_element(path: Path, header: Header, element: Element) -> np.ndarray:
-    """The rows of an element of a PLY with this header. Raises CheckpointError."""
+    """The rows of an element of a PLY with this header. Raises CheckpointError, also where the file ends before they do."""
+    least = sum(each.count * header.least_bytes(each) for each in (*header.before(element), element))
+    if header.body + least > path.stat().st_size + (header.format == "ascii"):  # the last value needs no blank behind it
+        raise CheckpointError(f"{path} is truncated: it ends before its element {element.name!r} does; download or copy it again")
     if header.format == "ascii" or any(other.has_lists for other in header.before(element)):
         return _read_through_plyfile(path, header, element)
     start = header.body + sum(other.count * other.stride for other in header.before(element))

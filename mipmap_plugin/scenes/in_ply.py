@@ -4,38 +4,33 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
+import numpy as np
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import CheckpointError, MipmapPluginError, SceneError
-from mipmap_plugin.formats.ply import Header, read_element, read_header
+from mipmap_plugin.errors import MipmapPluginError, SceneError
+from mipmap_plugin.formats.ply import read_element, read_header
+
+# Rows of the camera's elements, each of which has one property of its own name.
+ROWS = {"intrinsic": 9, "extrinsic": 16, "image_size": 2}
 
 
-def cameras_in(ply: Path | None) -> list[Camera]:
+def cameras_in(ply: str | Path | None) -> list[Camera]:
     """The camera in a PLY, by its elements `intrinsic` (3 x 3), `extrinsic` (4 x 4, from the world to the camera) and `image_size` (width, height).
 
     Empty for any other file. Raises SceneError for a camera that is none. (Elements: ml-sharp, src/sharp/utils/gaussians.py, `save_ply`.)
     """
-    if ply is None or not ply.is_file():
+    try:
+        header = read_header(ply) if ply is not None and Path(ply).is_file() else None
+    except MipmapPluginError:  # no PLY, or a damaged one, of which whoever reads its splats tells
+        header = None
+    if ply is None or header is None:
+        return []
+    found = {element.name: element for element in header.elements if element.count == ROWS.get(element.name) and element.names == (element.name,)}
+    if len(found) < len(ROWS) or any(element.has_lists for element in found.values()):
         return []
     try:
-        header = read_header(ply)
-        intrinsic, extrinsic, size = (_numbers(ply, header, name, count) for name, count in (("intrinsic", 9), ("extrinsic", 16), ("image_size", 2)))
-    except CheckpointError:  # no PLY, or a damaged one, of which whoever reads its splats tells
-        return []
-    if not (intrinsic and extrinsic and size):
-        return []
-    fx, _, cx, _, fy, cy, *_ = intrinsic
-    try:
-        return [Camera(int(size[0]), int(size[1]), fx, fy, cx, cy, torch.tensor(extrinsic, dtype=torch.float64).view(4, 4), name="photograph")]
-    except (MipmapPluginError, ValueError, OverflowError) as error:  # the latter of a size that is no number
+        intrinsic, extrinsic, size = (read_element(Path(ply), header, found[name])[name] for name in ROWS)
+        pose, matrix = extrinsic.reshape(4, 4).astype(np.float64), intrinsic.reshape(3, 3).astype(np.float64)
+        return [Camera.of_matrices(pose, matrix, *size.tolist(), name="photograph")]
+    except MipmapPluginError as error:
         raise SceneError(f"{ply}: the camera in it is none: {error}; give others (--cameras)") from error
-
-
-def _numbers(ply: Path, header: Header, name: str, count: int) -> list[float]:
-    """The `count` values of the element `name`, which has one property of the same name; empty if there is no such element."""
-    for element in header.elements:
-        if (element.name, element.names, element.count) == (name, (name,), count) and not element.has_lists:
-            values: list[float] = read_element(ply, header, element)[name].tolist()
-            return values
-    return []
