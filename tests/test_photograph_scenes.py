@@ -9,7 +9,10 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from mipmap_plugin import wrap_model
+from mipmap_plugin.adaptation.optimization.validation import split_validation
+from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.errors import SceneError
+from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes import cameras_in, load_scene
 from mipmap_plugin.scenes.trajectories import SWAY, Orbit, with_company
 
@@ -34,6 +37,15 @@ def test_the_camera_is_that_of_the_photograph(tmp_path, text):
     assert [each.fx for each in load_scene(tmp_path / "photo.ply").cameras] == [40.0]
 
 
+@pytest.mark.parametrize("scale", [1 / 2, 2])
+def test_views_to_its_sides_are_adapted_to_and_validated_by(scale):
+    lone, orbit, config = tiny.cameras(1), Orbit((0.0, 0.0, 0.0), None, 1.0), recipe("default", scale, views="jittered", extra_views=4)
+    views, _ = choose_views(lone, orbit, config)
+    adapted, validation = split_validation(lone, views, orbit, scale, config)
+    for seen in adapted[1:], validation:
+        assert max((view.center - lone[0].center).norm() for view in seen) > SWAY / 4
+
+
 def test_the_adapted_file_is_seen_from_there_too(tmp_path):
     adapted = wrap_model(sharp(tmp_path / "photo.ply")).adapt(1 / 2, steps=1, extra_views=3)
     saved = adapted.save(tmp_path / "half.ply")
@@ -45,7 +57,7 @@ def test_the_adapted_file_is_seen_from_there_too(tmp_path):
 def test_a_camera_that_is_none_is_refused_and_other_elements_are_none(tmp_path):
     with pytest.raises(SceneError, match=r"photo.ply: the camera in it is none: .* focal lengths must be positive .*; give others \(--cameras\)"):
         wrap_model(sharp(tmp_path / "photo.ply", (0.0, *INTRINSIC[1:])))
-    with pytest.raises(SceneError, match="the camera in it is none: .* width must be a whole number, got nan"):
+    with pytest.raises(SceneError, match=r"the camera in it is none: .* width must be a whole number, got nan"):
         wrap_model(sharp(tmp_path / "size.ply", size=(np.nan, 24.0)))
     others = sharp(tmp_path / "other.ply", (40.0, 40.0)), tmp_path / "other.plain.ply", tmp_path / "none.ply"
     assert [cameras_in(other) for other in others] == [[], [], []]
