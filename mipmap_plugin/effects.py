@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from mipmap_plugin.config import AdaptConfig
@@ -95,9 +95,9 @@ MODEL_EFFECTS = (
 
 
 def as_outputs(names: Sequence[str] | None) -> tuple[str, ...]:
-    """What is rendered besides the image, as `Effects.outputs`. Raises SettingsError for a text, which is a sequence too."""
-    if isinstance(names, str):
-        raise SettingsError(f"outputs must be a sequence of names, such as [{names!r}], got {names!r}")
+    """What is rendered besides the image, as `Effects.outputs`. Raises SettingsError for what is no sequence, and for a text, which is one too."""
+    if names is not None and (isinstance(names, str) or not isinstance(names, Iterable)):
+        raise SettingsError(f"outputs must be a sequence of names, such as ['depth'], got {names!r}")
     return tuple(names or ())
 
 

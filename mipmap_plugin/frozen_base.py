@@ -181,8 +181,8 @@ class FrozenBase:
         float32, and torch may have one thread, in the whole process: torch has one of each. Raises SettingsError and BackendUnavailable.
         """
         scale, cameras = check_scale(scale), None if cameras is None else of_base_scale(cameras, some=True)
-        finer: FinerLevel | None = as_start(start, viewer)
-        check_kinds(images=(images, Scene), start=(finer, FinerLevel), observe=(observe, Callable))
+        finer = as_start(start, viewer)
+        check_kinds(images=(images, Scene), observe=(observe, Callable))
         state = None if resume is None else path_of(resume, "resume")
         model = self._fused if viewer is not None and self.model.traits.filtered else self.model
         settings = mergeable_settings(model, settings)

@@ -44,6 +44,7 @@ def test_cameras_may_be_a_path(tmp_path):
     (lambda adapted: adapted.render("a.png"), "cameras must be of the type mipmap_plugin.Camera, got str"),
     (lambda adapted: adapted.render(adapted.views()), "cameras must be of the type mipmap_plugin.Camera, got list"),
     (lambda adapted: adapted.render(adapted.views()[0], outputs="depth"), "outputs must be a sequence of names, such as"),
+    (lambda adapted: adapted.render(adapted.views()[0], outputs=3), "outputs must be a sequence of names, such as"),
     (lambda adapted: adapted.save(None), "^path must be a text such as 'output/bicycle', or a pathlib.Path, got NoneType$"),
     (lambda adapted: adapted.save(""), "^path must be a text .*, got an empty text$"),
 ])  # fmt: skip
@@ -83,6 +84,8 @@ def test_an_adapted_model_may_be_what_a_coarser_one_starts_from(adapted):
         base.adapt(1 / 4, start=adapted, viewer="spark")
     with pytest.raises(SettingsError, match=r"start: x0\.5 is not finer than x0\.5"):
         base.adapt(1 / 2, start=adapted)
+    with pytest.raises(SettingsError, match="start must be a model that was adapted to a finer scale, got Wrapped"):
+        base.adapt(1 / 4, start=base)
 
 
 def test_a_path_of_photographs_is_told_what_reads_it():

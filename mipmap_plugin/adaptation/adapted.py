@@ -144,10 +144,12 @@ class Adapted:
         return "" if self.report.viewer else drawn_otherwise(path, self.model.trained)
 
 
-def as_start(start: Any, viewer: str | None) -> Any:
-    """What an adaptation for `viewer` starts from: of an adapted model, its splats. Raises SettingsError if that was made for another viewer."""
-    if not isinstance(start, Adapted):
+def as_start(start: Any, viewer: str | None) -> FinerLevel | None:
+    """What an adaptation for `viewer` starts from: of an adapted model, its splats. Raises SettingsError for anything else, or for another viewer."""
+    if start is None or isinstance(start, FinerLevel):
         return start
+    if not isinstance(start, Adapted):
+        raise SettingsError(f"start must be a model that was adapted to a finer scale, got {type(start).__name__}")
     if start.report.viewer != viewer:
         made, wanted = (name or "what draws as the training did" for name in (start.report.viewer, viewer))
         raise SettingsError(f"start: it is made for {made}, and not for {wanted}; leave it out, or give the same viewer")
