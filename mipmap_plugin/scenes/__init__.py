@@ -28,7 +28,7 @@ __all__ = [
 
 def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     """The scene at `path`: a model folder with a cameras.json, that file itself, a transforms file of any name or its folder, a COLMAP
-    scene, or one of DyNeRF or HyperNeRF as 4DGaussians reads them.
+    scene, one of DyNeRF or HyperNeRF as 4DGaussians reads them, or a PLY that has a camera in it (`cameras_in`).
 
     `cfg` is the checkpoint's cfg_args, which determine the test split and training size (`read_cameras`, `read_colmap`). A folder
     with both COLMAP's `sparse` and transforms files is read from `sparse`, as graphdeco-inria does.
