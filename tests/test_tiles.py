@@ -637,6 +637,9 @@ def test_files_of_the_web_are_converted_before_they_are_cut(tmp_path):
     rows.tofile(tmp_path / "my room.splat")
     with pytest.raises(SettingsError, match=r"convert it first \(splat-transform 'my room.splat' 'my room_plain.ply'\), or leave --tiles out"):
         find_splats(tmp_path / "my room.splat")
+    tiny.model(9).save(tmp_path / "room.glb", provenance={})
+    with pytest.raises(SettingsError, match=r"first \(load_model\('room.glb'\).save\(Path\('room_plain.ply'\), provenance={}\) in Python\)"):
+        find_splats(tmp_path / "room.glb")
 
 
 def test_anchors_cannot_be_cut(tmp_path, job):

@@ -36,10 +36,11 @@ def find_splats(path: Path) -> tuple[Checkpoint, type[VanillaModel]]:
     """The checkpoint at `path`, and what reads its columns. Raises CheckpointError; SettingsError for a family that cannot be cut."""
     checkpoint = detect(path)
     kind = KINDS.get(checkpoint.family)
-    if checkpoint.family == "exchange":
-        plain = checkpoint.path.with_name(checkpoint.path.name.split(".")[0] + "_plain.ply").name
-        remedy = f"convert it first (splat-transform {shlex.join([checkpoint.path.name, plain])}), or leave --tiles out"
-        raise SettingsError(f"{checkpoint.path}: only a plain PLY is cut into tiles; {remedy}")
+    if checkpoint.family in ("exchange", "gltf"):
+        name, plain = checkpoint.path.name, checkpoint.path.with_name(checkpoint.path.name.split(".")[0] + "_plain.ply").name
+        in_python = f"load_model({name!r}).save(Path({plain!r}), provenance={{}}) in Python"
+        how = f"splat-transform {shlex.join([name, plain])}" if checkpoint.family == "exchange" else in_python
+        raise SettingsError(f"{checkpoint.path}: only a plain PLY is cut into tiles; convert it first ({how}), or leave --tiles out")
     if kind is None or checkpoint.path.suffix.lower() != ".ply":
         raise SettingsError(
             f"{checkpoint.path}: a checkpoint of {checkpoint.family} cannot be cut into tiles, only the PLY of 3DGS or 2DGS, whose splats are"
