@@ -417,7 +417,7 @@ def test_evaluate_averages_several_scenes_and_prints_the_published_rows(run, mod
     assert code == 0
     assert "| one       | x0.25 | P3 " in out and "| mean of 2 | x0.25 | P3 " in out
     assert "published, mean over the 8 scenes of NeRF-Synthetic" in out and "Mipmap-GS (arXiv 2408.06286)" in out
-    refused(run("evaluate", model_folder, "--images", *scenes, "--scale", "1/4"), "--images is given 2 times")
+    refused(run("evaluate", model_folder, "--images", *scenes, "--scale", "1/4"), "--images: give one for each checkpoint", "; got 2, for 1 of these")
 
 
 def test_a_lone_file_is_judged_by_photographs_with_the_cameras_that_are_given(run, tmp_path):
@@ -428,7 +428,7 @@ def test_a_lone_file_is_judged_by_photographs_with_the_cameras_that_are_given(ru
     refused(run("evaluate", lone, *words), "its base scale is not known; give its model folder, or its cameras (--cameras)")
     quick = ["--output", tmp_path / "out", "--recipe", "instant", "--no-picture", "--no-renderers", "--repeats", "1", "--supersampling", "2"]
     assert run("tradeoff", lone, "--images", scene, "--scale", "1/2", *quick, "--cameras", scene)[0] == 0
-    refused(run("evaluate", lone, *words, "--cameras", scene, scene), "give one --cameras PATH for each checkpoint: --cameras is given 2 times")
+    refused(run("evaluate", lone, *words, "--cameras", scene, scene), "--cameras: give one for each checkpoint", "; got 2, for 1 of these")
 
 
 def test_evaluate_refuses_what_cannot_be_judged(run, model_folder, tmp_path):

@@ -155,10 +155,10 @@ def _scene(folder: Path, appearance: str) -> Scene:
 
 
 def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], cameras: Sequence[Path], outputs: Sequence[Path], overwrite: bool) -> None:
-    for option, given in {"--images DIR": images, "--cameras PATH": cameras or checkpoint}.items():
+    for option, given in {"--images": images, "--cameras": cameras or checkpoint}.items():
         if len(checkpoint) != len(given):
-            name, times = option.split()[0], f"is given {len(given)} times, for {len(checkpoint)} of these"
-            raise SettingsError(f"give one {option} for each checkpoint: {name} {times}")
+            how = f"one for each checkpoint, all behind one {option} (a second {option} replaces the first)"
+            raise SettingsError(f"{option}: give {how}; got {len(given)}, for {len(checkpoint)} of these")
     if len(set(outputs)) < len(outputs):
         raise SettingsError(f"{outputs[0]}: the page is written there; give the rows another name, such as {outputs[0].with_suffix('.json')}")
     read = [part for path in checkpoint for part in _parts(path)] + [file for folder in images for file in folder.glob("transforms*.json")]
