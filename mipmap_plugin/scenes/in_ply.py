@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import MipmapPluginError, SceneError
 from mipmap_plugin.formats.ply import read_element, read_header
@@ -30,7 +28,7 @@ def cameras_in(ply: str | Path | None) -> list[Camera]:
         return []
     try:
         intrinsic, extrinsic, size = (read_element(Path(ply), header, found[name])[name] for name in ROWS)
-        pose, matrix = extrinsic.reshape(4, 4).astype(np.float64), intrinsic.reshape(3, 3).astype(np.float64)
+        pose, matrix = extrinsic.reshape(4, 4).astype(float), intrinsic.reshape(3, 3).astype(float)
         return [Camera.of_matrices(pose, matrix, *size.tolist(), name="photograph")]
     except MipmapPluginError as error:
         raise SceneError(f"{ply}: the camera in it is none: {error}; give others (--cameras)") from error
