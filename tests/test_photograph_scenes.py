@@ -12,6 +12,8 @@ from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation.optimization.validation import split_validation
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.errors import SceneError
+from mipmap_plugin.evaluation.tradeoff.truth import base_itself, unseen
+from mipmap_plugin.levels.yardstick import Yardstick
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes import cameras_in, load_scene
 from mipmap_plugin.scenes.trajectories import SWAY, Orbit, with_company
@@ -44,6 +46,13 @@ def test_views_to_its_sides_are_adapted_to_and_validated_by(scale):
     adapted, validation = split_validation(lone, views, orbit, scale, config)
     for seen in adapted[1:], validation:
         assert max((view.center - lone[0].center).norm() for view in seen) > SWAY / 4
+
+
+def test_levels_and_tradeoffs_are_measured_to_its_sides_too():
+    lone = tiny.cameras(1)
+    base = wrap_model(tiny.model(20), cameras=lone, backend="reference")
+    for judged in Yardstick(base, 0)._views, base_itself(base, 1 / 2, None).views, unseen(base, lone):
+        assert max((view.center - lone[0].center).norm() for view in judged) > SWAY / 4
 
 
 def test_the_adapted_file_is_seen_from_there_too(tmp_path):

@@ -16,7 +16,7 @@ from mipmap_plugin.adaptation.views import showing
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.limits import derived_seed
-from mipmap_plugin.scenes.trajectories import jittered
+from mipmap_plugin.scenes.trajectories import jittered, with_company
 
 # Random views, of so many times as many the first that show something; of large images only the middle is used, as for validation.
 VIEWS, TRIED = 4, 4
@@ -35,7 +35,7 @@ class Yardstick:
 
     def __init__(self, base: FrozenBase, seed: int) -> None:
         generator = torch.Generator().manual_seed(derived_seed(seed, DRAW))
-        views = jittered(base.views(), TRIED * VIEWS, generator, spread=False)
+        views = jittered(with_company(base.views(), base.orbit()), TRIED * VIEWS, generator, spread=False)
         shown = showing(views, base.model.parameters()["means"], base.effects().near_plane)  # between objects far apart there is nothing
         self._views = [view.window(WINDOW, WINDOW) for view in (shown or views)[:VIEWS]]
         self._images = {view: base.render(view).image.clamp(0, 1) for view in self._views}

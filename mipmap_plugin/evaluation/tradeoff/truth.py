@@ -20,6 +20,7 @@ from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.other_scene import of_another_scene
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, TruthView, test_views
 from mipmap_plugin.scenes import Scene, jittered
+from mipmap_plugin.scenes.trajectories import with_company
 from mipmap_plugin.wrap import Wrapped
 
 # Of a checkpoint without test views, one camera in this many is held out, as mip-NeRF 360 does.
@@ -85,7 +86,8 @@ def base_itself(model: Wrapped, scale: float, most: int | None, views: Sequence[
 
 def unseen(model: Wrapped, adapted_to: Sequence[Camera]) -> list[Camera]:
     """Views that nothing was adapted to: the cameras that are not among those `adapted_to` or, if all are, a generated one."""
-    views = _others(model.cameras, adapted_to) or jittered(model.views(), 1, torch.Generator().manual_seed(EVALUATION_SEED))
+    generator = torch.Generator().manual_seed(EVALUATION_SEED)
+    views = _others(model.cameras, adapted_to) or jittered(with_company(model.views(), model.orbit()), 1, generator)
     return with_times(views, EVALUATION_SEED)[0] if model.model.traits.moves else views
 
 
@@ -100,7 +102,7 @@ def _held_out(model: Wrapped) -> tuple[list[Camera], list[Camera]]:
     elif rest := _others(model.cameras, model.cameras[::HELD_OUT_EVERY]):
         judged, train = model.cameras[::HELD_OUT_EVERY], rest
     else:
-        judged, train = jittered(model.cameras, HELD_OUT_EVERY, generator), model.cameras
+        judged, train = jittered(with_company(model.cameras, model.orbit()), HELD_OUT_EVERY, generator), model.cameras
     return (with_times(judged, EVALUATION_SEED)[0] if model.model.traits.moves else judged), train
 
 
