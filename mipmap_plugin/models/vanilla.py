@@ -34,6 +34,7 @@ from mipmap_plugin.splatting.rotations import unit_quaternions
 
 Model = TypeVar("Model", bound="VanillaModel")
 
+
 @dataclass(frozen=True, eq=False)
 class Origin:
     """Where a model was read from, and the contents of its file that are kept unchanged.
