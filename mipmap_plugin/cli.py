@@ -4,6 +4,7 @@ told to end (SIGTERM, SIGHUP), 141 where whoever read what is printed has stoppe
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
@@ -40,9 +41,15 @@ app.command(name="list")(list_)
 app.command(demo)
 
 
+def _at_home(word: str) -> str:
+    """A word with "~" as the home folder: shells leave it behind a "=" and in quotes, and that of Windows everywhere."""
+    option, equals, value = word.rpartition("=") if word.startswith("--") else ("", "", word)
+    return option + equals + os.path.expanduser(value)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """The entry point; returns the exit code."""
-    words = sys.argv[1:] if arguments is None else list(arguments)
+    words = [_at_home(word) for word in (sys.argv[1:] if arguments is None else arguments)]
     voice.take_any_text()
     if words == ["--version"]:
         print(f"mipmap-plugin {version('mipmap-plugin')}")

@@ -653,3 +653,11 @@ def test_the_module_runs():
     done = subprocess.run([sys.executable, "-m", "mipmap_plugin", "--help"], capture_output=True, text=True, cwd=root)
     assert done.returncode == 0 and done.stderr == ""
     assert all(command in done.stdout for command in ("inspect", "adapt", "render", "evaluate", "backends", "demo"))
+
+
+@pytest.mark.parametrize("output", [[], ["--output", "~/half.ply"], ["--output=~/half.ply"]])
+def test_a_tilde_is_the_home_folder_where_no_shell_says_so(run, tmp_path, monkeypatch, output):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    tiny.ply(tmp_path / "base.ply")
+    code, out, _ = run("adapt", "~/base.ply", "--scale", "1/2", "--recipe", "instant", *output)
+    assert code == 0 and str(tmp_path / ("half.ply" if output else "base_x0.5.ply")) in out and "~" not in out
