@@ -15,6 +15,7 @@ from mipmap_plugin.camera import Camera, viewmat_of
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.json_file import MAX_SIDE, numbers, pixels, positive, present, read_json, rotation
+from mipmap_plugin.limits import path_of
 
 # INRIA's reader holds out every eighth photograph of a COLMAP scene.
 TEST_EVERY = 8
@@ -35,7 +36,7 @@ def read_cameras(path: str | Path, cfg: dict[str, Any] | None = None) -> list[Ca
     Raises:
         SceneError: a file or an entry that cannot be read, or an invalid `resolution`.
     """
-    path, cfg = Path(path), cfg or {}
+    path, cfg = path_of(path), cfg or {}
     entries = read_json(path)
     if not isinstance(entries, list) or not entries:
         lacks = "lists no cameras" if entries == [] else "is not a list of cameras"
@@ -56,8 +57,9 @@ def write_cameras(path: str | Path, cameras: Sequence[Camera], *, overwrite: boo
     A principal point off the image center is written as cx and cy, which INRIA's readers do not know and some descendants do.
     """
     ordered = sorted(cameras, key=lambda camera: camera.split != "test")
-    write_json(Path(path), [_entry(index, camera) for index, camera in enumerate(ordered)], overwrite)
-    return Path(path)
+    path = path_of(path)
+    write_json(path, [_entry(index, camera) for index, camera in enumerate(ordered)], overwrite)
+    return path
 
 
 def _entry(index: int, camera: Camera) -> dict[str, Any]:
