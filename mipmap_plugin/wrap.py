@@ -71,8 +71,8 @@ def wrap_model(
 
     A checkpoint is loaded to the GPU if a backend serves it there (`backends.device_for`); a model stays on its device.
 
-    `cameras`: views of the scale of its training, or the scene that it was trained on or its path; by default those beside the checkpoint, or
-    those of the base of an adapted file.
+    `cameras`: views of the scale of its training, or the scene that it was trained on or its path; by default those beside the checkpoint,
+    or in it, or those of the base of an adapted file.
     `threads`: to adapt with; by default as many as torch has. With the backend cpu the result does not depend on it.
     `options`: `background`, linear RGB, by default that of the checkpoint, or else black; `screen_filter`, that it was trained with, if its
     files do not say ("classic", "antialiased", "mip", "analytic"); `up`, the axis that is up ("z", "-y", ...), if they do not say: views that

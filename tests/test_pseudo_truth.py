@@ -19,6 +19,7 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.recipes import recipe
+from mipmap_plugin.scenes.trajectories import Orbit
 
 TRAINED = Effects(sh_degree=1)
 
@@ -111,7 +112,7 @@ def test_an_unknown_upsampler_is_refused_before_anything_is_rendered():
 
 def chosen(views, cameras=None, **settings):
     cameras = tiny.cameras(4) + tiny.cameras(2, seed=5, split="test") if cameras is None else cameras
-    return choose_views(cameras, tiny.gaussians().means, AdaptConfig(views=views, **settings)), cameras
+    return choose_views(cameras, Orbit.around(tiny.gaussians().means), AdaptConfig(views=views, **settings)), cameras
 
 
 @pytest.mark.parametrize(

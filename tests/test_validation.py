@@ -39,9 +39,10 @@ from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.models.base import Traits
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.recipes import recipe
+from mipmap_plugin.scenes.trajectories import Orbit
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
-MEANS = tiny.gaussians().means
+ORBIT = Orbit.around(tiny.gaussians().means)
 SCALE = 1 / 4
 
 # So bold that every step does harm.
@@ -63,8 +64,8 @@ def same(model, other) -> bool:
 
 def held_back(cameras, policy, scale=SCALE, **settings):
     config = recipe("default", scale, **{"views": policy, "extra_views": 8, **settings})
-    views, _ = choose_views(cameras, MEANS, config)
-    return split_validation(cameras, views, MEANS, scale, config)
+    views, _ = choose_views(cameras, ORBIT, config)
+    return split_validation(cameras, views, ORBIT, scale, config)
 
 
 def poses(views):
@@ -82,7 +83,7 @@ def test_no_view_of_validation_is_adapted_to(policy):
 @pytest.mark.parametrize(("policy", "kept"), [("train", 2), ("jittered", 2), ("given", 0), ("test", 0), ("orbit", 0)])
 def test_given_cameras_are_kept_back_only_where_the_choice_is_ours(policy, kept):
     cameras = tiny.cameras(MANY) + tiny.cameras(MANY, seed=2, split="test")
-    wanted, _ = choose_views(cameras, MEANS, recipe("default", SCALE, views=policy, extra_views=8))
+    wanted, _ = choose_views(cameras, ORBIT, recipe("default", SCALE, views=policy, extra_views=8))
     left, judged = held_back(cameras, policy)
     assert len(poses(cameras) & poses(judged)) == len(wanted) - len(left) == kept
 

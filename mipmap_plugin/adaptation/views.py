@@ -142,23 +142,17 @@ def orbit_of(model: SplatModel, up: tuple[float, float, float] | None, means: Te
     return orbit if up is None else replace(orbit, up=up, said=True)
 
 
-def orbit_around(around: Tensor | Orbit) -> Orbit:
-    """An orbit, or that around means [N, 3]."""
-    return around if isinstance(around, Orbit) else Orbit.around(around)
-
-
-def choose_views(cameras: Sequence[Camera], around: Tensor | Orbit, config: AdaptConfig) -> tuple[list[Camera], str]:
-    """Return the base-scale cameras to adapt to, and a description of them. `around`: what an orbit surrounds, such as means [N, 3].
+def choose_views(cameras: Sequence[Camera], orbit: Orbit, config: AdaptConfig) -> tuple[list[Camera], str]:
+    """Return the base-scale cameras to adapt to, and a description of them. `orbit`: what generated views go around.
 
     Raises SettingsError when the policy finds no cameras.
     """
     generator = torch.Generator().manual_seed(config.seed)
     if config.views == "orbit" or not cameras:
         pixels = math.ceil(2 * math.tan(ORBIT_FOV / 2) * cameras[0].fx) if cameras else ORBIT_PIXELS  # the cameras' own focal length
-        found = orbit_around(around)
-        views = found.views((pixels, pixels), config.extra_views or ORBIT_VIEWS, generator)
+        views = orbit.views((pixels, pixels), config.extra_views or ORBIT_VIEWS, generator)
         reason = "as requested" if cameras else "the checkpoint came without cameras"
-        told = f" {found.told()}," if found.up else ""
+        told = f" {orbit.told()}," if orbit.up else ""
         return views, f"{len(views)} views of a generated orbit{told} at {pixels} px ({reason})"
     if config.views == "given":
         return list(cameras), f"the {len(cameras)} given views"
@@ -167,7 +161,7 @@ def choose_views(cameras: Sequence[Camera], around: Tensor | Orbit, config: Adap
     if not views:
         raise SettingsError(f"there are no {split} views among the {len(cameras)} cameras; use the view policy 'given'")
     if config.views == "jittered":
-        extra = jittered(with_company(views, orbit_around(around)), config.extra_views, generator)
+        extra = jittered(with_company(views, orbit), config.extra_views, generator)
         return views + extra, f"{len(views)} train views and {len(extra)} around them"
     return views, f"the {len(views)} {split} views"
 

@@ -17,11 +17,11 @@ def cameras_in(ply: str | Path | None) -> list[Camera]:
 
     Empty for any other file. Raises SceneError for a camera that is none. (Elements: ml-sharp, src/sharp/utils/gaussians.py, `save_ply`.)
     """
+    if ply is None or not Path(ply).is_file():
+        return []
     try:
-        header = read_header(ply) if ply is not None and Path(ply).is_file() else None
+        header = read_header(ply)
     except MipmapPluginError:  # no PLY, or a damaged one, of which whoever reads its splats tells
-        header = None
-    if ply is None or header is None:
         return []
     found = {element.name: element for element in header.elements if element.count == ROWS.get(element.name) and element.names == (element.name,)}
     if len(found) < len(ROWS) or any(element.has_lists for element in found.values()):

@@ -20,7 +20,7 @@ from mipmap_plugin.levels.distance.walks import WalkTruth, backed, focal_of, for
 from mipmap_plugin.levels.yardstick import DRAW, VIEWS
 from mipmap_plugin.limits import derived_seed
 from mipmap_plugin.models.base import SplatModel
-from mipmap_plugin.scenes.trajectories import jittered
+from mipmap_plugin.scenes.trajectories import jittered, with_company
 
 # Samples of the truth per pixel along each side: more than a level is adapted to. In walks over flowers, three agree with six to 67 dB.
 SAMPLES = 3
@@ -62,7 +62,8 @@ class Walks:
 
     def __init__(self, scene: Scene, levels: Sequence[SplatModel]) -> None:
         generator = torch.Generator().manual_seed(derived_seed(int(scene.request.settings.get("seed", 0)), DRAW))
-        seeing = [view for view in (*jittered(scene.views, VIEWS, generator), *scene.views) if math.isfinite(self._depth(view, scene))]
+        around = with_company(scene.views, scene.base.orbit())
+        seeing = [view for view in (*jittered(around, VIEWS, generator), *scene.views) if math.isfinite(self._depth(view, scene))]
         self.views = seeing[:VIEWS]
         self._truth = WalkTruth((scene.splats, scene.backend, scene.base.effects()), scene.views, {}, SAMPLES)
         self._scene, self._mixture = scene, Mixture.of(scene.rule, scene.chunks, [scene.splats_of(model) for model in levels])
