@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 from gpu_records import Adaptation, Checked, Failure, FirstUse, Kernel, Profile, Speed, Views
@@ -26,6 +27,10 @@ KEYS = {
     "profiles": ("backend", "splats", "width", "height"), "conformance": ("backend",), "adaptation": ("base", "scale", "backend", "viewer"),
     "first_uses": ("backend", "viewer"), "failures": ("backend", "what", "reason"),
 }  # fmt: skip
+
+
+# Characters of a reason: what a backend lacks for viewers is a long list.
+REASON = 200
 
 
 @dataclass(frozen=True)
@@ -112,5 +117,16 @@ def report(results: Results) -> str:
     lines = [f"# {known['device']}", f"{made}; {machine}.{copied}", speed_table(results.speed, results.bandwidth), views_table(results.views)]
     lines += [adaptation_table(results.adaptation), first_use_table(results.first_uses), conformance_table(results.conformance)]
     lines += [profile_table(results.profiles, results.bandwidth)]
-    lines += [f"Not measured: {' '.join(filter(None, [failure.backend, failure.what]))}: {failure.reason}" for failure in results.failures]
+    lines += [not_measured(results.failures)]
     return "\n\n".join(filter(None, lines))
+
+
+def not_measured(failures: Sequence[Failure]) -> str:
+    """What was left out, and why. Empty where nothing was."""
+    rows = [f"- {_name(failure)}: {shorten(failure.reason, REASON, placeholder=' ...')}" for failure in failures if not failure.late]
+    rows += [f"- No time was left for {late}." for late in ["; ".join(_name(failure) for failure in failures if failure.late)] if late]
+    return "## Not measured\n\n" + "\n".join(rows) if rows else ""
+
+
+def _name(failure: Failure) -> str:
+    return " ".join(filter(None, [failure.backend, failure.what]))

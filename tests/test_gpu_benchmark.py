@@ -132,7 +132,13 @@ def test_speeds_are_compared_with_gsplat_in_the_same_run():
 def test_wrong_cases_are_named():
     outcomes = [Outcome("fine", 0.0, True, True, ""), Outcome("odd", 0.5, True, False, "differs"), Outcome("left", 0.0, True, True, "", skipped=True)]
     page = report(Results(MACHINE, conformance=[Checked.of("triton", outcomes)]))
-    assert "| triton  | 1 of 2           | 1          | 0           | odd   |" in page and "- triton, odd: differs" in page
+    assert "| triton  | 1 of 2           | 1          | 0           |" in page and "- triton, odd: differs" in page
+
+
+def test_what_is_missing_is_short_and_what_had_no_time_is_one_line():
+    late = [Failure("inria", what, "no time was left", late=True) for what in ("x2", "x4")]
+    page = report(Results(MACHINE, failures=[Failure("gsplat", "x2", "it does not support " + 99 * "this, "), *late]))
+    assert page.endswith("- No time was left for inria x2; inria x4.") and max(map(len, page.splitlines())) < 300
 
 
 def test_hard_cases_are_shared_among_processes():
@@ -162,7 +168,7 @@ def test_the_report_and_its_files_are_named_after_the_device(tmp_path):
     results.save(tmp_path)
     text = (tmp_path / "nvidia_h200_sxm.md").read_text()
     assert text.startswith("# NVIDIA H200 (SXM)\n\nMade by `python benchmarks/gpu.py --data DATA`; memory_gib 139. A copy moves 4000 GB/s")
-    assert "Not measured: inria: it is not there" in text
+    assert "## Not measured\n\n- inria: it is not there" in text
     assert "| `kernel` | 100 | 50%             | 2        | 1000 | 25%         | 31.5%     | 64 " in text
     again = Results.of(MACHINE, tmp_path)
     assert again == results and again.speed == [replace(OURS, both_ms=4.5)]

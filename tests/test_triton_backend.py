@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
@@ -77,6 +79,23 @@ def test_the_kernels_compile_where_there_is_no_gpu(capability, tmp_path, monkeyp
         ptx = compile_for(capability, weighing.weigh_kernel, sizes.WARPS, TILE=tile, BATCH=sizes.BATCH, DETERMINISTIC=in_order, VIEWER=in_order)
         assert ("atom" in ptx or "red.global" in ptx) != in_order
     compile_for(capability, adam.adam_kernel, BANDS=4, BLOCK=sizes.NUMBERS_MOVED)
+
+
+KEYS = """
+import sys
+from mipmap_plugin.backends.triton_kernels import drawing, stepping
+kernels = {name: value for module in (drawing, stepping) for name, value in vars(module).items() if name.endswith("_kernel")}
+for name in sorted(kernels, reverse=sys.argv[1] == "backward"):
+    kernels[name].cache_key
+print(len(kernels), sorted(kernel.cache_key for kernel in kernels.values()))
+"""
+
+
+@pytest.mark.skipif(MISSING, reason="triton is not installed")
+def test_commands_that_call_kernels_in_another_order_find_what_was_compiled():
+    commands = [subprocess.Popen([sys.executable, "-c", KEYS, order], stdout=subprocess.PIPE, text=True) for order in ("forward", "backward")]
+    forward, backward = (command.communicate()[0] for command in commands)
+    assert forward == backward and forward.startswith("10 ")
 
 
 class PretendedDriver:

@@ -1,7 +1,7 @@
 """INRIA's `diff_gaussian_rasterization` as a backend, in both generations, if the user has built it. No code of it is included.
 
-The arguments were verified with a stand-in that renders what they say (`tests/test_inria_backend.py`). On a GPU only alpha was: the build that was
-tried there lacks the instructions that store colors. The rasterizer's conventions are fixed; requests are adapted to them:
+The arguments were verified with a stand-in that renders what they say (`tests/test_inria_backend.py`), and on a GPU with the older generation.
+The rasterizer's conventions are fixed; requests are adapted to them:
 
 - its near plane is 0.2: the scene is scaled so that the requested near plane lies there. The eye becomes the origin, so no digits are lost;
 - its dilation is 0.3 px²: the difference is added to each splat as variance along the camera's x and y, which projects to just that;
@@ -11,8 +11,8 @@ tried there lacks the instructions that store colors. The rasterizer's conventio
 - it returns no alpha: on request the splats are rendered once more, in white.
 
 Remaining differences: a splat ends at three standard deviations of its longer axis, rounded up to whole 16-px tiles, where up to 0.011
-of its opacity is left; the gradient of alpha ignores the clamp at 0.99; the gradient of a shape is attenuated by
-det²/(det² + 1e-7) of its dilated covariance, which matters below 0.1 px²; SH is limited to degree 3.
+of its opacity is left; the gradient of alpha ignores the clamp at 0.99, and that of the depth the clamp of the Jacobian, beyond the image's edge;
+the gradient of a shape is attenuated by det²/(det² + 1e-7) of its dilated covariance, which matters below 0.1 px²; SH is limited to degree 3.
 """
 
 from __future__ import annotations
@@ -56,7 +56,6 @@ class InriaBackend:
     name = "inria"
     api_version = API_VERSION
     speed = 20
-    note = "its colors were not tested on a GPU by this package's author"
     capabilities = Capabilities(
         devices=frozenset({"cuda"}),
         dtypes=frozenset({torch.float32}),

@@ -43,10 +43,13 @@ class Launch(NamedTuple):
 
 
 def compile_ahead(splats: KernelSplats, shots: Sequence[Shot], calls: Calls) -> None:
-    """Compile what draws such splats as each of the shots, on all threads."""
+    """Compile what draws such splats as each of the shots, on all threads; one kernel before the others, for with the first Triton hashes itself
+    and its compiler, and threads that find this missing would each do it."""
     different = {(launch.kernel.__name__, *launch.constants.items()): launch for launch in launches(splats, shots, calls)}
-    with ThreadPoolExecutor(min(len(different), threads.for_kernels())) as pool:
-        list(pool.map(lambda launch: launch.compile(splats.means.device), different.values()))
+    *others, quick = different.values()
+    quick.compile(splats.means.device)
+    with ThreadPoolExecutor(threads.for_kernels()) as pool:
+        list(pool.map(lambda launch: launch.compile(splats.means.device), others))
 
 
 def launches(splats: KernelSplats, shots: Sequence[Shot], calls: Calls) -> Iterator[Launch]:

@@ -11,10 +11,11 @@ import triton
 from torch import Tensor
 
 from mipmap_plugin.backends.triton_kernels import BACK_BATCH, BATCH, RECORD, SPLATS, WARPS, tile_for
-from mipmap_plugin.backends.triton_kernels.binning import Splatted
+from mipmap_plugin.backends.triton_kernels.binning import Splatted, emit_kernel
 from mipmap_plugin.backends.triton_kernels.colors_back import color_back_kernel
 from mipmap_plugin.backends.triton_kernels.compositing import composite_kernel
 from mipmap_plugin.backends.triton_kernels.compositing_back import composite_back_kernel, gather_kernel
+from mipmap_plugin.backends.triton_kernels.hashing import hash_in_order
 from mipmap_plugin.backends.triton_kernels.lists import Lists, Part, Tiling
 from mipmap_plugin.backends.triton_kernels.projection import project_kernel
 from mipmap_plugin.backends.triton_kernels.projection_back import project_back_kernel
@@ -22,6 +23,11 @@ from mipmap_plugin.backends.triton_kernels.rounding import round_kernel
 from mipmap_plugin.backends.triton_kernels.views import Shot, view_parameters
 from mipmap_plugin.backends.triton_kernels.weighing import weigh_kernel
 from mipmap_plugin.render_settings import USUAL
+
+hash_in_order(
+    project_kernel, emit_kernel, composite_kernel, round_kernel, weigh_kernel,
+    composite_back_kernel, gather_kernel, color_back_kernel, project_back_kernel,
+)  # fmt: skip
 
 # Rows of one splat that are summed at a time: one per lane of a warp.
 ROWS = 32
@@ -103,6 +109,10 @@ class Drawing(NamedTuple):
         """The part of each view [h, w, ...] of an array [V, pixels, ...]."""
         cameras = [shot.camera for shot in self.projected.shots]
         return [row[: camera.width * camera.height].unflatten(0, camera.size) for row, camera in zip(array, cameras, strict=True)]
+
+    def alpha_of(self, view: int) -> Tensor:
+        """The alpha of a view, [h, w]."""
+        return self.views_of(1 - self.transmittances)[view]
 
     def packed(self, views: Sequence[Tensor]) -> Tensor:
         """The inverse of `views_of`, for contiguous rows; what lies after a view's pixels is not set."""

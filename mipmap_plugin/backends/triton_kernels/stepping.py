@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import torch
 import triton
@@ -12,11 +13,14 @@ from mipmap_plugin.backends.base import AdamStep, Rendered
 from mipmap_plugin.backends.triton_kernels import NUMBERS_MOVED
 from mipmap_plugin.backends.triton_kernels.adam import adam_kernel
 from mipmap_plugin.backends.triton_kernels.drawing import Drawing, KernelSplats, draw, draw_back, project_back, rounded
+from mipmap_plugin.backends.triton_kernels.hashing import hash_in_order
 from mipmap_plugin.backends.triton_kernels.views import Shot
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.buckets import ranks_of_views
+
+hash_in_order(adam_kernel)
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 RATES = ("means", "quats", "scales", "opacities", "sh0", "shN")  # as `adam.py` reads them
@@ -38,8 +42,7 @@ class TritonStepper:
         with torch.cuda.device_of(self._splats.means):
             drawn = self._drawn[number] = draw(self._splats, self._ranked(shots))
             images = rounded(drawn)
-        alphas = 1 - drawn.transmittances
-        return [Rendered(image, alpha) for image, alpha in zip(drawn.views_of(images), drawn.views_of(alphas), strict=True)]
+        return [Rendered(image, partial(drawn.alpha_of, view)) for view, image in enumerate(drawn.views_of(images))]
 
     def _ranked(self, shots: Sequence[tuple[Camera, Effects]]) -> list[Shot]:
         """The shots, with the order of the splats where it is that of buckets."""

@@ -45,12 +45,17 @@ NUMBERS = tl.constexpr(51)  # of each view
 
 
 def view_parameters(shots: Sequence[Shot], tile: int, gradients: bool, like: Tensor) -> Tensor:
-    """The array [V, NUMBERS], on the device of `like`. A copy of some hundred bytes that does not synchronize."""
-    rows = [_of_camera(shot.camera, shot.effects, tile) + _of_settings(shot.camera, shot.effects.settings, gradients) for shot in shots]
-    return torch.tensor(rows, dtype=like.dtype).to(like.device, non_blocking=True)
+    """The array [V, NUMBERS], on the device of `like`."""
+    return torch.stack([_row(shot.camera, shot.effects, tile, gradients, like.dtype, like.device) for shot in shots])
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=4096)
+def _row(camera: Camera, effects: Effects, tile: int, gradients: bool, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The numbers of a view, which the steps of an adaptation draw again and again. A copy of some hundred bytes that does not synchronize."""
+    numbers = _of_camera(camera, effects, tile) + _of_settings(camera, effects.settings, gradients)
+    return torch.tensor(numbers, dtype=dtype).to(device, non_blocking=True)
+
+
 def _of_camera(camera: Camera, effects: Effects, tile: int) -> tuple[float, ...]:
     margin = effects.settings.frozen_beyond / 2
     margin_x, margin_y = margin * camera.width / camera.fx, margin * camera.height / camera.fy
@@ -68,7 +73,6 @@ def _of_camera(camera: Camera, effects: Effects, tile: int) -> tuple[float, ...]
     )
 
 
-@lru_cache(maxsize=1024)
 def _of_settings(camera: Camera, settings: RenderSettings, gradients: bool) -> tuple[float, ...]:
     is_cut = settings.radius is not None and not settings.fades
     return (
