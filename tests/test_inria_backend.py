@@ -126,9 +126,15 @@ def test_a_principal_point_far_off_comes_to_the_middle(center, left, width):
     assert frame.crop(image)[0].tolist() == list(range(left, left + 40))
 
 
-def test_what_is_missing_is_reported(monkeypatch):
+@pytest.fixture
+def without_package(monkeypatch):
+    """No rasterizer is installed; all else is, for other backends remember what they lack."""
     find_spec = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == PACKAGE else find_spec(name))
+
+
+@pytest.mark.usefixtures("without_package")
+def test_what_is_missing_is_reported(monkeypatch):
     assert InriaBackend().lacking(USUAL) == [NO_PACKAGE]
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
@@ -144,8 +150,8 @@ def test_what_is_missing_is_reported(monkeypatch):
     assert InriaBackend().lacking(replace(USUAL, sh_degree=4)) == ["it evaluates SH up to degree 3, not 4"]
 
 
-def test_it_is_listed_with_its_reasons_and_refuses(monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+@pytest.mark.usefixtures("without_package")
+def test_it_is_listed_with_its_reasons_and_refuses():
     assert "inria" in BACKENDS.names()
     assert survey(replace(USUAL, device="cpu"))["inria"] == [NO_PACKAGE, "it runs on cuda, not on cpu"]
     with pytest.raises(BackendUnavailable, match="backend 'inria' cannot do this: it needs diff_gaussian_rasterization"):
