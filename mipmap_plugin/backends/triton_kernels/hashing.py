@@ -14,4 +14,4 @@ def hash_in_order(*kernels: Any) -> None:
     for kernel in kernels:
         if getattr(kernel, "cache_key", None):  # Triton's interpreter keeps nothing
             # Each launch compares the constants that a kernel was compiled for with those in its module: a hundred of them in a step.
-            kernel.used_global_vals.clear()
+            getattr(kernel, "used_global_vals", {}).clear()
