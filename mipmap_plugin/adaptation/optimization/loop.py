@@ -154,8 +154,8 @@ def _compare_all(
     """`_compare` of several views: in one operation where their images are of one size, since a GPU waits for each."""
     if len(images) == 1 or task.detail is not None or len({image.shape for image in (*images, *targets)}) > 1:
         return [_compare(task, config, *each) for each in zip(views, images, targets, strict=True)]
-    differences = torch.stack([image.detach() for image in images]) - torch.stack(list(targets))
-    return list(zip(*gradient_of(differences, config.loss), strict=True))
+    gradients, square_errors = gradient_of(torch.stack(list(images)).detach() - torch.stack(list(targets)), config.loss)
+    return list(zip(gradients.unbind(), square_errors.unbind(), strict=True))
 
 
 def _compare(task: Task, config: AdaptConfig, view: Camera, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:

@@ -107,8 +107,10 @@ class Drawing(NamedTuple):
 
     def views_of(self, array: Tensor) -> list[Tensor]:
         """The part of each view [h, w, ...] of an array [V, pixels, ...]."""
-        cameras = [shot.camera for shot in self.projected.shots]
-        return [row[: camera.width * camera.height].unflatten(0, camera.size) for row, camera in zip(array, cameras, strict=True)]
+        sizes = [shot.camera.size for shot in self.projected.shots]
+        if len(set(sizes)) == 1:  # the views of a step: few operations, for each makes a GPU wait
+            return list(array.unflatten(1, sizes[0]).unbind())
+        return [row[: height * width].unflatten(0, (height, width)) for row, (height, width) in zip(array, sizes, strict=True)]
 
     def alpha_of(self, view: int) -> Tensor:
         """The alpha of a view, [h, w]."""
@@ -118,7 +120,7 @@ class Drawing(NamedTuple):
         """The inverse of `views_of`, for contiguous rows; what lies after a view's pixels is not set."""
         sizes = {view.shape for view in views}
         if len(sizes) == 1:
-            return torch.stack([view.flatten(0, 1) for view in views]) if len(views) > 1 else views[0].contiguous().flatten(0, 1)[None]
+            return torch.stack(list(views)).flatten(1, 2) if len(views) > 1 else views[0].contiguous().flatten(0, 1)[None]
         array = views[0].new_empty(len(views), self.projected.most_pixels, *views[0].shape[2:])
         for row, view in zip(array, views, strict=True):
             row[: view.shape[0] * view.shape[1]] = view.flatten(0, 1)
