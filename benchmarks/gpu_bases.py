@@ -26,6 +26,7 @@ from mipmap_plugin.formats.images import pillow_bicubic
 from mipmap_plugin.models.base import SplatModel, TrainedScale
 from mipmap_plugin.models.mip import MipModel, filter_3d_of, smooth_3d
 from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.progress import counted
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.scenes.cameras_json import write_cameras
 
@@ -95,7 +96,7 @@ class Training:
 
     def run(self) -> None:
         """All steps."""
-        for step, camera, photograph in self.photographs.shuffled(self.steps):
+        for step, camera, photograph in counted(self.photographs.shuffled(self.steps), self.steps, "training", "step"):
             self._find_filters(step)
             image, info = self.image(camera, min(step // BAND_EVERY, DEGREE))
             self.strategy.step_pre_backward(self.splats, self.optimizers, self.state, step, info)
