@@ -88,6 +88,7 @@ from mipmap_plugin.backends.triton_kernels import drawing, stepping
 kernels = {name: value for module in (drawing, stepping) for name, value in vars(module).items() if name.endswith("_kernel")}
 for name in sorted(kernels, reverse=sys.argv[1] == "backward"):
     kernels[name].cache_key
+assert not any(kernel.used_global_vals for kernel in kernels.values())
 print(len(kernels), sorted(kernel.cache_key for kernel in kernels.values()))
 """
 
