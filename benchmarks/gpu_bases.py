@@ -3,12 +3,16 @@
     python benchmarks/gpu_bases.py SCENE --width 400 --steps 7000 --mode classic --output lego_400
 
 SCENE is what `mipmap_plugin.load_scene` reads; views of its test split are not trained on. Rates, losses and refinement are those of 3DGS
-(arXiv:2308.04079) as gsplat's own trainer has them; `mip` is Mip-Splatting (arXiv:2311.16493): its 3D filter, and the antialiased one of 0.1 px².
+(arXiv:2308.04079) as gsplat's own trainer has them, which in 1.5.3 never resets opacities; `mip` is Mip-Splatting (arXiv:2311.16493): its 3D filter,
+and the antialiased one of 0.1 px². What cannot be trained ends with a sentence and exit code 2.
 """
 
 from __future__ import annotations
 
+import os
+import sys
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,14 +25,18 @@ from torch import Tensor
 
 from mipmap_plugin import Camera, load_scene
 from mipmap_plugin.adaptation.target.structure import similarity
+from mipmap_plugin.backends.gsplat import missing
+from mipmap_plugin.errors import BackendUnavailable, MipmapPluginError, OutputExists, SceneError, SettingsError
+from mipmap_plugin.formats.atomic import refuse_unwritable
 from mipmap_plugin.formats.cfg_args import format_cfg_args
 from mipmap_plugin.formats.images import pillow_bicubic
+from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.models.base import SplatModel, TrainedScale
 from mipmap_plugin.models.mip import MipModel, filter_3d_of, smooth_3d
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.progress import counted
 from mipmap_plugin.scenes import Scene
-from mipmap_plugin.scenes.cameras_json import write_cameras
+from mipmap_plugin.scenes.cameras_json import read_cameras, write_cameras
 
 Mode = Literal["classic", "antialiased", "mip"]
 FILTERS: dict[Mode, tuple[str, float]] = {"classic": ("classic", 0.3), "antialiased": ("antialiased", 0.3), "mip": ("mip", 0.1)}  # variance in px²
@@ -45,7 +53,11 @@ RANDOM_POINTS, RANDOM_WITHIN = 100_000, 1.3
 # Mip-Splatting finds its filters again after so many steps.
 FILTER_EVERY = 100
 
-CHUNK = 4096  # points whose distances to all others are found at once
+# Of a point, whose mean square distance is the square of its splat's size; and the points whose distances to all others are found at once.
+NEIGHBORS, CHUNK = 3, 4096
+
+WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+DEVICE = "cuda"  # the only one that gsplat serves
 
 
 @dataclass(frozen=True)
@@ -57,9 +69,13 @@ class Photographs:
 
     @classmethod
     def of(cls, scene: Scene, width: int, background: Sequence[float], device: str) -> Photographs:
-        """Shrunk as by protocol P3."""
+        """Shrunk as by protocol P3. Raises SceneError for a scene that cannot be trained on."""
         own = [camera for camera in scene.split("train") if camera in scene.images]
-        cameras = [camera.resized(width, round(width * camera.height / camera.width)) for camera in own]
+        cameras = [at_width(camera, width) for camera in own]
+        if len({tuple(camera.center.tolist()) for camera in cameras}) < 2:
+            raise SceneError(f"{scene.source} has {len(own)} photographs to train on; training needs some that were taken from different places")
+        if len(heights := sorted({camera.height for camera in cameras})) > 1:
+            raise SceneError(f"{scene.source}: its photographs, {width} px wide, are {heights[0]} to {heights[-1]} px high; give some of one shape")
         images = [pillow_bicubic(scene.image(camera, background), small.size) for camera, small in zip(own, cameras, strict=True)]
         return cls(cameras, (torch.stack(images) * 255).round().byte().to(device))
 
@@ -75,6 +91,11 @@ class Photographs:
         """The scene's size, world units."""
         centers = torch.stack([camera.center for camera in self.cameras])
         return SIZE_MARGIN * float((centers - centers.mean(0)).norm(dim=1).max())
+
+
+def at_width(camera: Camera, width: int) -> Camera:
+    """The same view, `width` px wide."""
+    return camera.resized(width, max(1, round(width * camera.height / camera.width)))
 
 
 class Training:
@@ -140,11 +161,12 @@ class Training:
 
 
 def first_splats(points: Tensor | None, device: torch.device) -> dict[str, Tensor]:
-    """Gray splats as large as the distance to their neighbors, at the points [P, 3] of structure from motion or at random."""
-    if points is None:
+    """Gray splats as large as the distance to their neighbors, at the points [P, 3] of structure from motion, or at random if these are too few."""
+    if points is None or len(points) <= NEIGHBORS:
         points = (2 * torch.rand(RANDOM_POINTS, 3, generator=torch.Generator().manual_seed(0)) - 1) * RANDOM_WITHIN
     means, count = points.float().to(device), len(points)
-    nearest = [torch.cdist(some, means).topk(4, largest=False)[0][:, 1:] for some in means.split(CHUNK)]
+    exact = "donot_use_mm_for_euclid_dist"  # products lose the distances of points that are far from the origin
+    nearest = [torch.cdist(some, means, compute_mode=exact).topk(NEIGHBORS + 1, largest=False)[0][:, 1:] for some in means.split(CHUNK)]
     lengths = torch.cat(nearest).square().mean(1).sqrt().clamp_min(1e-6)
     empty = {"sh0": torch.zeros(count, 1, 3, device=device), "shN": torch.zeros(count, (DEGREE + 1) ** 2 - 1, 3, device=device)}
     turns = torch.tensor([1.0, 0, 0, 0], device=device).repeat(count, 1)
@@ -158,8 +180,7 @@ def main(
     output: Path,
     steps: int = 7000,
     mode: Mode = "classic",
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0),
-    device: str = "cuda",
+    background: tuple[float, float, float] = WHITE,
 ) -> None:
     """Train and save.
 
@@ -169,11 +190,35 @@ def main(
         output: The model folder, which must not be there yet.
         steps: Of training; 3DGS takes 7000 or 30000.
         mode: The filter that is trained with.
-        background: RGB, 0..1, behind the splats and transparent photographs.
-        device: What torch calls it.
+        background: White or black (0 0 0), behind the splats and transparent photographs.
     """
+    try:
+        check(width, steps, output, background)
+        train(scene, width, output, steps, mode, background)
+    except MipmapPluginError as error:
+        print(f"benchmarks/gpu_bases.py: {error}", file=sys.stderr)
+        raise SystemExit(2) from error
+
+
+def check(width: int, steps: int, output: Path, background: Sequence[float]) -> None:
+    """Raise what a run would end with after a while."""
+    if reasons := missing():
+        raise BackendUnavailable("; ".join(reasons))
+    if width < 1 or steps < 1:
+        raise SettingsError(f"--width and --steps must be at least 1, got {width} and {steps}")
+    if tuple(background) not in (WHITE, BLACK):
+        raise SettingsError(f"--background must be 1 1 1 or 0 0 0, the two that cfg_args can say, got {' '.join(f'{part:g}' for part in background)}")
+    if output.suffix.lower() == ".ply" or is_written(output):
+        raise SettingsError(f"{output} is the name of a file; a base is a folder")
+    if os.path.lexists(output):
+        raise OutputExists(f"{output} exists already; remove it, or choose another path")
+    refuse_unwritable(output)
+
+
+def train(scene: Path, width: int, output: Path, steps: int, mode: Mode, background: tuple[float, float, float]) -> None:
+    """Train a base and save it, with its cameras."""
     loaded = load_scene(scene)
-    photographs = Photographs.of(loaded, width, background, device)
+    photographs = Photographs.of(loaded, width, background, DEVICE)
     training = Training(photographs, loaded.points, mode, steps, background)
     began = time.perf_counter()
     training.run()
@@ -186,10 +231,14 @@ def main(
 
 
 def save_cameras(folder: Path, scene: Scene, width: int, background: Sequence[float]) -> None:
-    """The cameras of both splits, and options that say that there are two."""
-    write_cameras(folder / "cameras.json", [camera.resized(width, round(width * camera.height / camera.width)) for camera in scene.cameras])
-    options = {"sh_degree": DEGREE, "source_path": "", "model_path": "", "images": "images", "resolution": 1, "eval": True, "data_device": "cuda"}
-    (folder / "cfg_args").write_text(format_cfg_args({**options, "white_background": tuple(background) == (1.0, 1.0, 1.0)}), encoding="utf-8")
+    """The cameras of all splits, and options that say whether there are views for testing."""
+    write_cameras(folder / "cameras.json", [at_width(camera, width) for camera in scene.cameras])
+    tests = [camera.name for camera in scene.split("test")]
+    options = {"sh_degree": DEGREE, "source_path": "", "model_path": "", "images": "images", "resolution": 1, "data_device": "cuda"}
+    options |= {"eval": bool(tests), "white_background": tuple(background) == WHITE}
+    if [camera.name for camera in read_cameras(folder / "cameras.json", options) if camera.split == "test"] != tests:
+        warnings.warn(f"{folder}/cameras.json cannot say which views are for testing; judge by those of {scene.source}", stacklevel=2)
+    (folder / "cfg_args").write_text(format_cfg_args(options), encoding="utf-8")
 
 
 if __name__ == "__main__":

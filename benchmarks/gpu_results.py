@@ -124,7 +124,8 @@ def report(results: Results) -> str:
 def not_measured(failures: Sequence[Failure]) -> str:
     """What was left out, and why. Empty where nothing was."""
     rows = [f"- {_name(failure)}: {shorten(failure.reason, REASON, placeholder=' ...')}" for failure in failures if not failure.late]
-    rows += [f"- No time was left for {late}." for late in ["; ".join(_name(failure) for failure in failures if failure.late)] if late]
+    late = "; ".join(_name(failure) for failure in failures if failure.late)
+    rows += [f"- No time was left for {late}."] if late else []
     return "## Not measured\n\n" + "\n".join(rows) if rows else ""
 
 

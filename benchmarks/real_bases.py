@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -55,7 +56,11 @@ def main(
         backend: A backend's name.
     """
     torch.set_num_threads(1)
-    for base in only or [base for base in SCALES if (data / "checkpoints" / "bases" / base).is_dir()]:
+    bases = only or tuple(base for base in SCALES if (data / "checkpoints" / "bases" / base).is_dir())
+    if not bases or not SCALES.keys() >= set(bases):
+        print(f"benchmarks/real_bases.py: {data} holds no such base; known are {', '.join(SCALES)}, in checkpoints/bases", file=sys.stderr)
+        raise SystemExit(2)
+    for base in bases:
         recipes = recipe or (RECIPES if max(SCALES[base]) > 1 else (*RECIPES, "thorough"))
         wrapped = wrap_model(data / "checkpoints" / "bases" / base, backend=backend)
         scene = load_scene(data / "images" / base.split("_")[0])

@@ -15,12 +15,12 @@ from conftest import SHARED
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 sys.path.append(str(BENCHMARKS))  # its modules import one another by bare names, as scripts do
 
+import real_bases  # noqa: E402
 import unbounded  # noqa: E402
 from ablations import ABLATIONS  # noqa: E402
 from backends import facts, joined  # noqa: E402
 from measure import Scaling, Speed, Spread, Timing  # noqa: E402
 from pages import write_page  # noqa: E402
-from real_bases import kept  # noqa: E402
 from scenes import make  # noqa: E402
 from tables import Row, Rows  # noqa: E402
 from workloads import Size, Variant, activated, count_pairs, effects_of, from_scene, from_variant, split_into  # noqa: E402
@@ -141,8 +141,8 @@ def judged(name: str) -> Judged:
 def test_rows_of_recipes_that_are_not_measured_again_are_kept_and_no_others(tmp_path):
     names = ["base", "base, resized", "window, 2 x 2 samples", "paper, 3 of 25 judged views adapted to", "default, scored", "thorough, held out"]
     write_json(tmp_path / "lego.json", records([judged(name) for name in names]), overwrite=True)
-    assert [row.name for row in kept(tmp_path / "lego.json", ("default",))] == [names[3], names[5]]
-    assert kept(tmp_path / "chair.json", ("default",)) == []
+    assert [row.name for row in real_bases.kept(tmp_path / "lego.json", ("default",))] == [names[3], names[5]]
+    assert real_bases.kept(tmp_path / "chair.json", ("default",)) == []
 
 
 def test_a_page_has_every_base_under_its_name(tmp_path):
@@ -225,3 +225,10 @@ def test_crispness_is_drawn(tmp_path):
     crisp = [zoomed_in(f"{kind}, crispness {each}", 26 - each, 0.09 - 0.02 * each) for kind in ("closed form", "default") for each in (0, 0.5, 1)]
     draw(tmp_path / "front.png", {"lego_100": [zoomed_in("base", 22.0), *crisp, zoomed_in("enlarged by bicubic", lpips=0.16)]})
     assert (tmp_path / "front.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("only", [(), ("lego_300",)])
+def test_bases_that_are_not_there_are_said_to_be(tmp_path, capsys, only):
+    with pytest.raises(SystemExit) as ending:
+        real_bases.main(tmp_path, tmp_path, only)
+    assert ending.value.code == 2 and f"{tmp_path} holds no such base; known are lego_200" in capsys.readouterr().err

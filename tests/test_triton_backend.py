@@ -7,6 +7,7 @@ import importlib.util
 import subprocess
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -87,6 +88,7 @@ from mipmap_plugin.backends.triton_kernels import drawing, stepping
 kernels = {name: value for module in (drawing, stepping) for name, value in vars(module).items() if name.endswith("_kernel")}
 for name in sorted(kernels, reverse=sys.argv[1] == "backward"):
     kernels[name].cache_key
+assert not any(kernel.used_global_vals for kernel in kernels.values())
 print(len(kernels), sorted(kernel.cache_key for kernel in kernels.values()))
 """
 
@@ -96,6 +98,20 @@ def test_commands_that_call_kernels_in_another_order_find_what_was_compiled():
     commands = [subprocess.Popen([sys.executable, "-c", KEYS, order], stdout=subprocess.PIPE, text=True) for order in ("forward", "backward")]
     forward, backward = (command.communicate()[0] for command in commands)
     assert forward == backward and forward.startswith("10 ")
+
+
+@pytest.mark.skipif(MISSING, reason="triton is not installed")
+@pytest.mark.parametrize("sizes", [[(3, 4)], [(3, 4), (3, 4)], [(3, 4), (4, 3)], [(2, 2), (3, 4), (1, 5)]], ids=str)
+def test_views_of_any_sizes_are_packed_and_found_again(sizes):
+    from mipmap_plugin.backends.triton_kernels import drawing
+
+    shots, most = [SimpleNamespace(camera=SimpleNamespace(size=size)) for size in sizes], max(height * width for height, width in sizes)
+    images, left = ([torch.rand(*size, *rest) for size in sizes] for rest in ((3,), ()))
+    empty = drawing.Drawing(SimpleNamespace(shots=shots, most_pixels=most), torch.empty(0), torch.empty(0))
+    drawn = empty._replace(transmittances=empty.packed(left))
+    assert empty.packed(images).shape == (len(sizes), most, 3)
+    assert all(torch.equal(found, image) for found, image in zip(drawn.views_of(empty.packed(images)), images, strict=True))
+    assert all(torch.equal(drawn.alpha_of(view), 1 - rest) for view, rest in enumerate(left))
 
 
 class PretendedDriver:

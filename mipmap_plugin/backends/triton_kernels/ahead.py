@@ -43,8 +43,10 @@ class Launch(NamedTuple):
 
 
 def compile_ahead(splats: KernelSplats, shots: Sequence[Shot], calls: Calls) -> None:
-    """Compile what draws such splats as each of the shots, on all threads; one kernel before the others, for with the first Triton hashes itself
-    and its compiler, and threads that find this missing would each do it."""
+    """Compile what draws such splats as each of the shots, on all threads.
+
+    One kernel comes before the others: with the first Triton hashes itself and its compiler, which threads that begin together would each do.
+    """
     different = {(launch.kernel.__name__, *launch.constants.items()): launch for launch in launches(splats, shots, calls)}
     *others, quick = different.values()
     quick.compile(splats.means.device)

@@ -114,7 +114,7 @@ class Drawing(NamedTuple):
 
     def alpha_of(self, view: int) -> Tensor:
         """The alpha of a view, [h, w]."""
-        return self.views_of(1 - self.transmittances)[view]
+        return 1 - self.views_of(self.transmittances)[view]
 
     def packed(self, views: Sequence[Tensor]) -> Tensor:
         """The inverse of `views_of`, for contiguous rows; what lies after a view's pixels is not set."""

@@ -10,8 +10,9 @@ def hash_in_order(*kernels: Any) -> None:
 
     A hash depends on which of the functions that a kernel calls were hashed before it. By itself Triton hashes a kernel at its first call, so
     that another command, which calls kernels in another order, or threads that compile side by side, would not find what was compiled before.
+
+    From then on the constants of their modules must not change: launches do not compare them any more, which are a hundred in a step.
     """
     for kernel in kernels:
-        if getattr(kernel, "cache_key", None):  # Triton's interpreter keeps nothing
-            # Each launch compares the constants that a kernel was compiled for with those in its module: a hundred of them in a step.
-            getattr(kernel, "used_global_vals", {}).clear()
+        getattr(kernel, "cache_key", "")  # which hashes it; Triton's interpreter has neither this nor the constants
+        getattr(kernel, "used_global_vals", {}).clear()
