@@ -34,8 +34,8 @@ INTRO = """# Real bases against real test images
 Made by `python benchmarks/real_bases.py DATA`. Protocol P3, mean of 25 test views; seconds on one thread of a shared machine.
 
 lego_400 and those after it were trained by gsplat in 7,000 steps, on the 100 training images of lego at 400 px (`gpu_bases.py`): with the filter of
-3DGS, with gsplat's `antialiased`, and as Mip-Splatting; lego_400_P1 by protocol P1. bird_544 is a phone's capture, trained likewise on 161 photographs and
-judged on 23. Their seconds are of a machine that was busy and half as fast.
+3DGS, with gsplat's `antialiased`, and as Mip-Splatting; lego_400_P1 by protocol P1. bird_544 is a phone's capture, trained on 161 photographs
+and judged on 23. Their seconds are of a machine that was busy and half as fast.
 """
 RECIPES: tuple[str, ...] = ("instant", "paper", "default")
 
