@@ -34,7 +34,7 @@ from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.models.base import SplatModel, TrainedScale
 from mipmap_plugin.models.mip import MipModel, filter_3d_of, smooth_3d
 from mipmap_plugin.models.vanilla import VanillaModel
-from mipmap_plugin.progress import counted
+from mipmap_plugin.progress import counted, note
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.scenes.cameras_json import read_cameras, write_cameras
 
@@ -163,6 +163,7 @@ class Training:
 def first_splats(points: Tensor | None, device: torch.device) -> dict[str, Tensor]:
     """Gray splats as large as the distance to their neighbors, at the points [P, 3] of structure from motion, or at random if these are too few."""
     if points is None or len(points) <= NEIGHBORS:
+        note(f"the scene has no points to begin at: {RANDOM_POINTS:,} lie at random within {RANDOM_WITHIN} of its origin, as suits NeRF-Synthetic")
         points = (2 * torch.rand(RANDOM_POINTS, 3, generator=torch.Generator().manual_seed(0)) - 1) * RANDOM_WITHIN
     means, count = points.float().to(device), len(points)
     exact = "donot_use_mm_for_euclid_dist"  # products lose the distances of points that are far from the origin

@@ -34,8 +34,11 @@ INTRO = """# Real bases against real test images
 Made by `python benchmarks/real_bases.py DATA`. Protocol P3, mean of 25 test views; seconds on one thread of a shared machine.
 
 lego_400 and those after it were trained by gsplat in 7,000 steps, on the 100 training images of lego at 400 px (`gpu_bases.py`): with the filter of
-3DGS, with gsplat's `antialiased`, and as Mip-Splatting; lego_400_P1 by protocol P1. bird_544 is a phone's capture, trained on 161 photographs
-and judged on 23. Their seconds are of a machine that was busy and half as fast.
+3DGS, with gsplat's `antialiased`, and as Mip-Splatting. Their seconds are of a machine that was busy and half as fast. Not by this command:
+
+- lego_400_P1: `mipmap-plugin evaluate lego_400 --images lego --protocol P1 --scale 1/2 --scale 1/4 --scale 1/8 --recipe default`.
+- lego_400_P1_area: the same at x1/4 and x1/8 by `mipmap_plugin.evaluation.evaluate.evaluate(..., resize="area")`: adapted to box averages.
+- bird_544: the same command by P3 and with `--recipe instant`, of a phone's capture that was trained on 161 photographs, judged on the 23 others.
 """
 RECIPES: tuple[str, ...] = ("instant", "paper", "default")
 

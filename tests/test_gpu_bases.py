@@ -59,9 +59,10 @@ def gsplat(monkeypatch):
 
 
 @pytest.mark.parametrize(("mode", "screen_filter", "eps2d"), [("classic", "classic", 0.3), ("antialiased", "antialiased", 0.3), ("mip", "mip", 0.1)])
-def test_a_base_is_trained_and_saved_with_its_filter_and_cameras(tmp_path, gsplat, mode, screen_filter, eps2d):
+def test_a_base_is_trained_and_saved_with_its_filter_and_cameras(tmp_path, gsplat, capsys, mode, screen_filter, eps2d):
     scene = tiny.scene(tmp_path / "scene", test=tiny.cameras(2, seed=5, split="test"), train=tiny.cameras(3))
     gpu_bases.main(scene, 12, tmp_path / "base", steps=4, mode=mode)
+    assert "no points to begin at: 40 lie at random" in capsys.readouterr().err
     base = wrap_model(tmp_path / "base")
     assert (base.model.trained.screen_filter, base.model.trained.eps2d, base.model.trained.background) == (screen_filter, eps2d, gpu_bases.WHITE)
     assert [camera.split for camera in base.cameras].count("test") == 2 and {camera.width for camera in base.cameras} == {12}
