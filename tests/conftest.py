@@ -54,6 +54,17 @@ def small_orbits(monkeypatch):
 
 
 @pytest.fixture
+def few_views():
+    """Recipes take 4 views beside the given ones and 4 for validation, in place of 100 and 16: for tests whose dB do not matter."""
+
+    def with_few(usual):
+        return lambda scale, network: {**usual(scale, network), "extra_views": 4, "validation_views": 4}
+
+    for name in ("default", "thorough", "paper", "instant"):
+        RECIPES.add(name, with_few(RECIPES.get(name)), replace=True)
+
+
+@pytest.fixture
 def brief_ladders(monkeypatch):
     """Levels by zoom are compared in one view and at few zooms: for tests of a ladder whose dB do not matter."""
     monkeypatch.setattr("mipmap_plugin.levels.yardstick.VIEWS", 1)

@@ -17,6 +17,8 @@ from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.models import zipped_folder
 from mipmap_plugin.scenes import load_scene, write_cameras
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 
 def instant(base, target, cameras=None):
     """A file adapted from `base` in no step."""

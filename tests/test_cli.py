@@ -36,6 +36,8 @@ from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 QUICK = ["--views", "given", "--steps", "2"]
 NO_STEP = ["--steps", "0"]
 

@@ -23,6 +23,8 @@ from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.scenes import Scene, load_scene
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 BRIEF = dict(steps=2, extra_views=1, check_every=1)
 
 

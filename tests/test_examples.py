@@ -11,6 +11,8 @@ import tiny
 from mipmap_plugin import cli, load_model, registry, wrap_model
 from mipmap_plugin.scenes import write_cameras
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 POINTS = [
     EntryPoint("careful", "register_backend:CarefulBackend", "mipmap_plugin.backends"),

@@ -32,6 +32,8 @@ from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.splatting.harmonics import basis
 from mipmap_plugin.splatting.projection import axes_of
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 # FORMATS §13, T5: a real record of a .splat file.
 RECORD = bytes.fromhex("7a72abc1b6e792c1f011b5c1b6cbe23f9f59683f0c309c4075c9fffff779599a")
 # Niantic's header: magic, version 3, one point, SH degree 0, 12 fractional bits, no flags.

@@ -36,7 +36,7 @@ from mipmap_plugin.tiles.job import TileJob
 from mipmap_plugin.wrap import Wrapped
 
 QUICK = ["--views", "given", "--steps", "2"]
-NO_STEP = ["--steps", "0"]
+NO_STEP = ["--views", "given", "--steps", "0"]
 
 
 @pytest.fixture

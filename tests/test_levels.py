@@ -41,7 +41,7 @@ from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.wrap import Interrupted
 
-pytestmark = pytest.mark.usefixtures("brief_ladders")
+pytestmark = pytest.mark.usefixtures("brief_ladders", "few_views")
 
 BRIEF = dict(steps=1, extra_views=1, validation_views=2, warm_up=0, views_per_step=1)
 

@@ -35,6 +35,8 @@ from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.pages.walks import walks_page
 from mipmap_plugin.scenes import write_cameras
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 RULE = DistanceRule(first=0.1, ratio=2.0, count=4)
 BRIEF = dict(steps=4, extra_views=2, validation_views=2, warm_up=0, views_per_step=1)
 

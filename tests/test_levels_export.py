@@ -22,7 +22,7 @@ from mipmap_plugin.levels.streamed import EXTENT, distances, nearer, progression
 from mipmap_plugin.levels.tiles import SCREEN_ERROR, bounding_box, errors, tileset, write_tile, write_tiles
 from mipmap_plugin.models import load_model
 
-pytestmark = pytest.mark.usefixtures("brief_ladders")
+pytestmark = pytest.mark.usefixtures("brief_ladders", "few_views")
 
 # A stand-in for splat-transform: it lists no GPU, writes its arguments to the output, with two chunks, and fails for a file that says that it is
 # broken, or has SH degree 4. Of an SPZ it writes the header: 60 splats of degree 1.

@@ -27,6 +27,8 @@ from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.scenes.trajectories import rotation_matrix
 from mipmap_plugin.wrap import wrap_model
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 
 def wrapped(**options):
     return wrap_model(tiny.model(30, **options), cameras=tiny.cameras(2), backend="reference")

@@ -27,6 +27,8 @@ from mipmap_plugin.models.mip import MipModel, filter_3d_of, sharpen_3d, smooth_
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 FILTERS = {"mip": ("mip", 0.1), "gof": ("mip", 0.0), "analytic": ("analytic", 0.0)}
 
 

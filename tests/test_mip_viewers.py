@@ -24,6 +24,8 @@ from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.splatting.viewers import find_viewer
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 FAMILIES = ("mip", "gof", "analytic")
 BRIEF = dict(steps=2, extra_views=2, merge_to=1.0, warm_up=0)
 

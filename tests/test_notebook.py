@@ -16,6 +16,8 @@ from mipmap_plugin.errors import MipmapPluginError, SettingsError
 from mipmap_plugin.formats.images import image_size
 from mipmap_plugin.models.adapted_scale import adapted_scale
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 NOTEBOOK = Path(__file__).parents[1] / "examples" / "notebook.ipynb"
 
 

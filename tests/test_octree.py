@@ -14,6 +14,8 @@ from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.torchscript import read_torchscript
 from mipmap_plugin.models import load_model
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 ALL = ("opacity_mlp", "cov_mlp", "color_mlp")
 
 LAYOUTS = {

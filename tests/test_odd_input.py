@@ -17,6 +17,8 @@ from mipmap_plugin.levels.finished import Ladder
 from mipmap_plugin.scenes import load_scene, write_cameras
 from mipmap_plugin.wrap import wrap_model
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 
 @pytest.fixture
 def adapted():

@@ -14,6 +14,8 @@ from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.evaluation.tradeoff.truth import photographs
 from mipmap_plugin.scenes import load_scene
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 DOUBT = "they may be of another scene, or their cameras in another frame; check --images"
 
 

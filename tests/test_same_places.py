@@ -16,6 +16,8 @@ from mipmap_plugin.cli import main
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models.adapted_scale import adapted_orbit
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 SCALE = 0.125
 Z = (0.0, 0.0, 1.0)
 

@@ -26,6 +26,8 @@ from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.wrap import wrap_model
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 LAYOUTS = {
     "plain": Layout(),
     "united": Layout(united=True),

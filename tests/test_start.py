@@ -22,6 +22,8 @@ from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting.viewers import find_viewer
 from mipmap_plugin.wrap import wrap_model
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 SCALE, COUNT = 1 / 4, 80
 
 

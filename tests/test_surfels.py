@@ -33,6 +33,8 @@ from mipmap_plugin.splatting.projection import Projected
 from mipmap_plugin.splatting.rotations import rotations
 from mipmap_plugin.wrap import wrap_model
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 EFFECTS = Effects(1, "surfel", 0.5)
 
 

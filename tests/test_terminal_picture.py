@@ -19,6 +19,8 @@ from mipmap_plugin.commands.terminal_picture import GAP, before_and_after, proto
 from mipmap_plugin.formats import terminal
 from mipmap_plugin.formats.terminal import encoded, has_sixels, protocol_by_name
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 KITTY = re.compile(r"\x1b_G([^;]*);([^\x1b]*)\x1b\\")
 
 

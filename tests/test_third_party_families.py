@@ -22,6 +22,8 @@ from mipmap_plugin.models.reading import load_vanilla
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import write_cameras
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 EXAMPLE, FILES = (runpy.run_path(str(Path(__file__).parents[1] / "examples" / name)) for name in ("register_family.py", "register_family_files.py"))
 
 

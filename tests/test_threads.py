@@ -21,6 +21,8 @@ from mipmap_plugin.models import load_model
 from mipmap_plugin.process import threads
 from mipmap_plugin.wrap import wrap_model
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 
 def parameters(count: int) -> dict[str, torch.Tensor]:
     wrapped = wrap_model(tiny.model(60), cameras=tiny.cameras(6), backend="cpu", threads=count)

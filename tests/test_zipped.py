@@ -17,6 +17,8 @@ from mipmap_plugin.formats import zipped
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.models import detect, load_model, zipped_folder
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 
 def archive(path, files):
     """A zip archive of files, by their names in it."""

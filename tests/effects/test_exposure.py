@@ -17,6 +17,8 @@ from mipmap_plugin.models.moving.model import MovingModel
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.wrap import wrap_model
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 IDENTITY = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0]]
 WARM = [[0.5, 0.2, 0.0, 0.01], [0.0, 0.25, 0.0, 0.02], [0.1, 0.0, 2.0, -0.03]]  # no two entries can change places
 

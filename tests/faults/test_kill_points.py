@@ -22,7 +22,7 @@ from mipmap_plugin.formats import staging
 from mipmap_plugin.models import load_model
 from mipmap_plugin.wrap import wrap_model
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+pytestmark = [pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork"), pytest.mark.usefixtures("few_views")]
 
 # By default one call in as many; no divisor of the calls that a file takes, so that in the end each kind has its turn.
 FEW = 7

@@ -18,6 +18,8 @@ from mipmap_plugin.models import load_model
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 BAD_SCALES = [1e5, 1e308, 1e-50, 1e-10, 0, -1, math.nan, math.inf]
 NO_SCALES = [True, "1/4", None, [0.25], 1j, 10**400]
 BAD_COLORS = [(math.nan,) * 3, (1e30, 0, 0), (0.5, 0.5), (0, 0, 0, 0), (-0.1, 0, 0), (math.inf, 0, 0), "red", 5, (None, 0, 0), ("x", 0, 0)]

@@ -24,6 +24,8 @@ from mipmap_plugin.levels.room import room_for
 from mipmap_plugin.models import load_model
 from mipmap_plugin.wrap import wrap_model
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 INSTANT = ["--recipe", "instant"]
 
 

@@ -13,6 +13,8 @@ from test_families import FAMILIES
 
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 VIEWS = tiny.cameras(3, width=8, height=6)
 SMALL = [view.resized(2, 1) for view in VIEWS]
 
@@ -49,7 +51,7 @@ def digest(folder) -> str:
     return hashlib.sha256(b"".join(path.name.encode() + path.read_bytes() for path in files)).hexdigest()
 
 
-def some(others, families=("3dgs", "scaffold"), common=("everything pruned", "reference")):
+def some(others, families=("3dgs", "scaffold"), common=("everything pruned", "cpu")):
     """Each family with `others`: two with all of them, and the rest, but for what is common, only among the slow tests."""
     return [
         pytest.param(family, other, marks=[] if family in families or other in common else [pytest.mark.slow])

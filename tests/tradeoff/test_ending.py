@@ -12,6 +12,8 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.wrap import wrap_model
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 STEPS = dict(steps=12, extra_views=0, check_every=2, patience=None)
 
 

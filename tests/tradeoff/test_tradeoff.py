@@ -25,6 +25,8 @@ from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.screen_filters import SCREEN_FILTERS
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 PLAN = Plan(recipes=("default",), steps=(6,), backends=("auto",), supersampling=(2,), renderers=False, repeats=2)
 BY_REFERENCE = replace(PLAN, backends=("reference",))
 
