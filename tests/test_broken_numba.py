@@ -1,5 +1,6 @@
 """A numba that is installed but does not load is as none: torch renders, slower, and one sentence says why and what to do."""
 
+import json
 import os
 import subprocess
 import sys
@@ -12,27 +13,37 @@ from mipmap_plugin.backends import cpu
 REMEDY = f"numba does not load: ImportError: Numba needs NumPy 2.2 or less; {cpu.REINSTALL}"
 
 
-@pytest.fixture
-def run(tmp_path):
-    """Adapts a scene in a process with a numba that does not load; returns its exit code, and the lines of its errors."""
-    package = tmp_path / "broken" / "numba"
+# Adapts by one backend after the other, and prints for each the exit code and what was said of numba.
+BY_BACKENDS = """
+import contextlib, io, json, sys
+from mipmap_plugin.cli import main
+told = {}
+for backend in ("auto", "cpu"):
+    with contextlib.redirect_stderr(io.StringIO()) as said:
+        code = main([*sys.argv[1:], "--backend", backend])
+    told[backend] = [code, [line for line in said.getvalue().splitlines() if "numba" in line]]
+print(json.dumps(told))
+"""
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory):
+    """What a process whose numba does not load tells by `BY_BACKENDS`."""
+    folder = tmp_path_factory.mktemp("broken_numba")
+    package = folder / "broken" / "numba"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text("raise ImportError('Numba needs NumPy 2.2 or less.')")
-    places = f"{package.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
-
-    def do(backend):
-        words = ["adapt", str(tiny.folder(tmp_path / "base")), "--scale", "1/2", "--steps", "1", "--views", "given", "--backend", backend]
-        environment = {**os.environ, "PYTHONPATH": places}
-        done = subprocess.run([sys.executable, "-m", "mipmap_plugin", *words], capture_output=True, text=True, env=environment)
-        return done.returncode, [line for line in done.stderr.splitlines() if "numba" in line]
-
-    return do
+    environment = {**os.environ, "PYTHONPATH": f"{package.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
+    words = ["adapt", str(tiny.folder(folder / "base")), "--scale", "1/2", "--steps", "1", "--views", "given", "--overwrite"]
+    done = subprocess.run([sys.executable, "-c", BY_BACKENDS, *words], capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
 
 
-def test_torch_takes_its_place(run):
+def test_torch_takes_its_place(told):
     said = f"mipmap-plugin: backend cpu cannot do this: {REMEDY}; the backend reference takes its place, many times slower"
-    assert run("auto") == (0, [said])
+    assert told["auto"] == [0, [said]]
 
 
-def test_the_backend_that_needs_it_ends_in_a_sentence(run):
-    assert run("cpu") == (2, [f"mipmap-plugin: backend 'cpu' cannot do this, but reference can: {REMEDY}"])
+def test_the_backend_that_needs_it_ends_in_a_sentence(told):
+    assert told["cpu"] == [2, [f"mipmap-plugin: backend 'cpu' cannot do this, but reference can: {REMEDY}"]]

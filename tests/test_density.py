@@ -1,9 +1,6 @@
 """Density control: rows, moments and statistics stay together, and an empty model never comes about."""
 
 import math
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 import tiny
@@ -362,14 +359,3 @@ def test_a_step_of_a_part_of_a_tensor_is_that_of_the_same_numbers_alone():
             adam.step()
             adam.zero_grad()
     assert alone.is_contiguous() and not part.is_contiguous() and torch.equal(alone, part)
-
-
-def test_adapting_loads_no_compiler_of_torch():
-    code = """
-import sys, tiny
-from mipmap_plugin import wrap_model
-wrap_model(tiny.model(20), cameras=tiny.cameras(), backend="cpu").adapt(1 / 2, steps=2, extra_views=2)
-print([name for name in ("torch._dynamo", "torch._inductor", "sympy") if name in sys.modules])
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parent, check=True)
-    assert done.stdout.strip() == "[]"

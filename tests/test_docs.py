@@ -268,11 +268,13 @@ LONG = [pytest.param(piece, marks=[pytest.mark.slow] if ".levels(" in piece.text
 
 
 @pytest.mark.parametrize("piece", LONG, ids=str)
+@pytest.mark.usefixtures("few_views")
 def test_python_runs(piece, tmp_path, monkeypatch):
-    """On a scene that adapts in a moment, in place of the reader's."""
+    """On a scene that adapts in a moment, in place of the reader's; a time budget has room for no more steps than usual."""
     assert unresolved(piece.text) == []
     tiny.folder(tmp_path / "output/bicycle", tiny.cameras(6))
     monkeypatch.setitem(DEFAULT_OUT, "steps", 20)
+    monkeypatch.setitem(DEFAULT_OUT, "most_steps", 20)
     monkeypatch.chdir(tmp_path)
     exec(compile(piece.text, str(piece), "exec"), {"__name__": "block"})
 

@@ -25,6 +25,8 @@ from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting import filters, harmonics
 from mipmap_plugin.wrap import wrap_model
 
+pytestmark = pytest.mark.usefixtures("few_views")
+
 BRIEF = dict(steps=2, extra_views=0)
 
 
@@ -222,27 +224,44 @@ def test_an_upsampler_that_is_called_for_is_imported(broken_upsampler):
         wrapped(with_bands(1, 1)).adapt(4, upsampler=broken_upsampler, compare_at="target", **BRIEF)
 
 
+# Prints, a line each, which modules were imported: by adapting, by rendering an image, and by rendering its depth too.
 IMPORTED = """
 import sys
 before = set(sys.modules)
 from mipmap_plugin import wrap_model
+def tell():
+    print(*sorted(name for name in sys.argv[3:] if name in set(sys.modules) - before))
 model = wrap_model(sys.argv[1], backend=sys.argv[2])
 for scale in (1 / 4, 2):
-    adapted = model.adapt(scale, steps=1, extra_views=0)
+    adapted = model.adapt(scale, steps=2, extra_views=2)
     adapted.render(model.cameras[0].zoomed(scale))
     adapted.save(f"{sys.argv[1]}_{scale}")
-print(sorted(name for name in sys.argv[3:] if name in set(sys.modules) - before))
+tell()
+model = wrap_model(sys.argv[1], backend="reference")
+for outputs in ([], ["depth"]):
+    model.render(model.cameras[0], outputs=outputs)
+    tell()
 """
 
-OPTIONAL = ["mipmap_plugin.backends.geometry"]
+OUTPUTS = "mipmap_plugin.backends.geometry"
+OPTIONAL = [OUTPUTS, "torch._dynamo", "torch._inductor", "sympy"]
 OPTIONAL += ["gsplat", "llvmlite", "lpips", "matplotlib", "numba", "pycolmap", "pytest", "skimage", "spandrel", "torchvision", "triton", "tyro"]
 
 
-@pytest.mark.parametrize("backend", [pytest.param("reference", marks=pytest.mark.slow), "cpu"])
-def test_adapting_imports_nothing_that_it_does_not_use(tmp_path, backend):
-    """What comes before the first step has kernels, whatever the backend."""
+@pytest.fixture(scope="module", params=[pytest.param("reference", marks=pytest.mark.slow), "cpu"])
+def imported(request, tmp_path_factory):
+    """The lines of `IMPORTED`, by words: one process for all that is asked of it."""
     pytest.importorskip("numba")
-    folder = tiny.folder(tmp_path / "base")
-    done = subprocess.run([sys.executable, "-c", IMPORTED, str(folder), backend, *OPTIONAL], capture_output=True, text=True)
+    folder = tiny.folder(tmp_path_factory.mktemp("imported") / "base")
+    done = subprocess.run([sys.executable, "-c", IMPORTED, str(folder), request.param, *OPTIONAL], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == str(["llvmlite", "numba"])
+    return [line.split() for line in done.stdout.splitlines()]
+
+
+def test_adapting_imports_nothing_that_it_does_not_use(imported):
+    """What comes before the first step has kernels, whatever the backend; torch compiles nothing."""
+    assert imported[0] == ["llvmlite", "numba"]
+
+
+def test_code_for_outputs_is_imported_only_for_them(imported):
+    assert [OUTPUTS in words for words in imported[1:]] == [False, True]

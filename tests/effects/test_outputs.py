@@ -1,8 +1,6 @@
 """Depth and normals besides the image: of known shapes, by any backend, and at no cost where they are not requested."""
 
 import math
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -174,22 +172,6 @@ def test_one_more_image_is_rendered_per_output_and_none_without(monkeypatch, out
     assert [effects.sh_degree for effects in drawn] == [2] + [0] * len(outputs)
     assert {name for name in BOTH if getattr(rendered, name) is not None} == set(outputs)
     assert {effect.name for effect in rendered.effects if effect.on} & set(BOTH) == set(outputs)
-
-
-IMPORTED = """
-import sys
-from mipmap_plugin import wrap_model
-model = wrap_model(sys.argv[1], backend="reference")
-for outputs in ([], ["depth"]):
-    model.render(model.cameras[0], outputs=outputs)
-    print("mipmap_plugin.backends.geometry" in sys.modules)
-"""
-
-
-def test_code_for_outputs_is_imported_only_for_them(tmp_path):
-    folder = tiny.folder(tmp_path / "base", count=5)
-    done = subprocess.run([sys.executable, "-c", IMPORTED, str(folder)], capture_output=True, text=True)
-    assert done.stdout.split() == ["False", "True"], done.stderr
 
 
 def test_an_adapted_model_renders_outputs_too():
