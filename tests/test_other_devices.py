@@ -161,12 +161,15 @@ def test_arguments_of_other_rasterizers_are_on_the_device(with_covariances):
 def test_no_step_waits_for_the_device(scale):
     """Whatever the host asks for before the first step and after the last, more steps ask for no more; backends aside."""
     counts = []
-    for steps in (2, 3):  # with a check at the end of both, and none between
-        with pretended.pretending() as device:
-            wrapped = wrap_model(tiny.model().to(pretended.DEVICE), cameras=VIEWS, backend="reference")
-            wrapped.adapt(scale, steps=steps, **FEW, check_every=100, prune_every=100)
-        counts.append({line: count for line, count in device.waits.items() if not line.startswith(("backends/", "splatting/"))})
-    assert counts[0] == counts[1]
+    with pretended.pretending() as device:
+
+        def count(*_):
+            counts.append({line: count for line, count in device.waits.items() if not line.startswith(("backends/", "splatting/"))})
+
+        wrapped = wrap_model(tiny.model().to(pretended.DEVICE), cameras=VIEWS, backend="reference")
+        settings = dict(FEW, closed_form=False, check_every=100, prune_every=100)  # with checks after the first step and the last
+        wrapped.adapt(scale, steps=4, observe=count, **settings)
+    assert len(counts) == 5 and counts[1] == counts[2] == counts[3]  # of those after 0 to 4 steps
 
 
 def cost(work) -> tuple[int, int]:

@@ -87,7 +87,7 @@ def test_truths_that_are_used_next_are_drawn_in_one_call():
             return [self.render(gaussians, *shot) for shot in shots]
 
     register_backend("noting", Noting, replace=True)
-    settings = dict(steps=6, views_per_step=1, extra_views=0, merge_to=1.0, validation_views=2)
+    settings = dict(steps=6, views_per_step=1, extra_views=0, closed_form=False, merge_to=1.0, validation_views=2)
     with pretended.pretending():
         wrapped = wrap_model(tiny.model().to(pretended.DEVICE), cameras=tiny.cameras(6, width=16, height=12), backend="noting")
         wrapped.adapt(1 / 4, **settings)

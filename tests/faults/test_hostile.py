@@ -135,15 +135,15 @@ def packed(path: Path) -> Path:
     """A sound file of 200 MB of zeros, made small."""
     content = io.BytesIO()
     torch.save({"a": torch.zeros(50_000_000)}, content)
-    with zipfile.ZipFile(content) as plain, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(content) as plain, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name in plain.namelist():
             archive.writestr(name, plain.read(name))
     return path
 
 
 def png(path: Path, width: int, height: int, channels: int) -> Path:
-    """A PNG of zeros, packed as small as it goes, row by row."""
-    packer, packed = zlib.compressobj(9), io.BytesIO()
+    """A PNG of zeros, packed row by row."""
+    packer, packed = zlib.compressobj(1), io.BytesIO()
     for _ in range(height):
         packed.write(packer.compress(bytes(1 + width * channels)))
     packed.write(packer.flush())
@@ -165,7 +165,7 @@ def test_no_small_file_takes_much_memory(tmp_path):
         ("torch", grows): executed,
         ("torch", packed(tmp_path / "packed.pth")): "its numbers unpack to more than it is on disk",
         ("script", script): "its tensors claim more numbers than the file holds",
-        ("image", png(tmp_path / "bomb.png", 9000, 9000, 4)): "no photograph",
+        ("image", png(tmp_path / "bomb.png", 5000, 5000, 4)): "no photograph",
         ("image", png(tmp_path / "sound.png", 2000, 2000, 4)): "read",
     }
     for (path, (memory, said)), sentence in zip(taken(list(wanted)).items(), wanted.values(), strict=True):
