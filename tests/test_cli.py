@@ -420,6 +420,14 @@ def test_evaluate_averages_several_scenes_and_prints_the_published_rows(run, mod
     refused(run("evaluate", model_folder, "--images", *scenes, "--scale", "1/4"), "--images: give one for each checkpoint", "; got 2, for 1 of these")
 
 
+def test_an_option_that_counts_once_is_not_given_twice(run, model_folder, tmp_path):
+    scenes = [tiny.scene(tmp_path / "one"), tiny.scene(tmp_path / "two")]
+    twice = ["--images", scenes[0], f"--images={scenes[1]}"]
+    refused(run("evaluate", model_folder, *twice, "--scale", "1/4"), "--images is given 2 times", "; give it once, with all its values behind it\n")
+    budgets = ["--time-budget-s", "1", "--time_budget_s", "2"]
+    refused(run("adapt", model_folder, "--scale", "1/4", *budgets), "--time-budget-s is given 2 times", "; give it once\n")
+
+
 def test_a_lone_file_is_judged_by_photographs_with_the_cameras_that_are_given(run, tmp_path):
     scene, lone = tiny.scene(tmp_path / "scene", train=tiny.cameras(2)), tiny.ply(tmp_path / "a.ply")
     words = ["--images", scene, "--scale", "1/2", "--no-report", "--json"]

@@ -157,7 +157,7 @@ def _scene(folder: Path, appearance: str) -> Scene:
 def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], cameras: Sequence[Path], outputs: Sequence[Path], overwrite: bool) -> None:
     for option, given in {"--images": images, "--cameras": cameras or checkpoint}.items():
         if len(checkpoint) != len(given):
-            how = f"one for each checkpoint, all behind one {option} (a second {option} replaces the first)"
+            how = f"one for each checkpoint, all behind one {option}"
             raise SettingsError(f"{option}: give {how}; got {len(given)}, for {len(checkpoint)} of these")
     if len(set(outputs)) < len(outputs):
         raise SettingsError(f"{outputs[0]}: the page is written there; give the rows another name, such as {outputs[0].with_suffix('.json')}")
