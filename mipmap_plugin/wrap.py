@@ -20,7 +20,7 @@ from mipmap_plugin.camera import Camera, digest_of, of_base_scale
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.frozen_base import RenderOptions as RenderOptions
-from mipmap_plugin.limits import check_background, check_names
+from mipmap_plugin.limits import check_background, check_names, path_of
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.adapted_scale import known_up
 from mipmap_plugin.models.base import SplatModel
@@ -119,7 +119,7 @@ def check_serves(backend: str, threads: int | None) -> None:
 def _found(model: SplatModel, cameras: Sequence[Camera] | Scene | str | Path | None) -> tuple[Sequence[Camera] | Scene, dict[str, str]]:
     """The cameras that are given, those beside the model's file, or, of an adapted file, those of its base; and `where` they were read from."""
     if isinstance(cameras, (str, Path)):
-        cameras = load_scene(cameras, read_options(model.folder)[0])
+        cameras = load_scene(path_of(cameras, "cameras"), read_options(model.folder)[0])
     if isinstance(cameras, Scene):
         return cameras, where(cameras.source, model.folder)
     if cameras is not None:
