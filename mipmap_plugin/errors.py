@@ -81,6 +81,16 @@ def is_temporary(path: object) -> bool:
     return re.search(rf"\b{TEMPORARY}[a-z0-9_]{{8}}\b", str(path)) is not None
 
 
+def with_article(noun: str) -> str:
+    """A noun behind its article: "an int", "a list"."""
+    return f"{'an' if noun[:1].lower() in 'aeio' else 'a'} {noun}"
+
+
+def type_of(value: object) -> str:
+    """The type of what was given in place of something else, behind its article."""
+    return with_article(type(value).__name__)
+
+
 def brief(error: BaseException) -> str:
     """The first line of another library's error."""
     return (str(error).splitlines() or [type(error).__name__])[0][:120]

@@ -49,9 +49,11 @@ class Registry:
 
     def get(self, name: str) -> Any:
         """Return the object of that name. Raises SettingsError for an unknown name, PluginError for a broken target."""
-        kind = self.group.rpartition(".")[2].removesuffix("s")
+        kinds = self.group.rpartition(".")[2]
+        kind = kinds.removesuffix("s")
         if not isinstance(name, str):  # most often the plug-in itself
-            raise SettingsError(f"a {kind} is given by its name, got {type(name).__name__}; register your own first, by register_{kind}(name, ...)")
+            own = f"register your own first, by register_{kind}(name, ...)"
+            raise SettingsError(f"{kinds} are given by their names, got {type(name).__name__}; {own}")
         if name not in self._targets and name not in self._installed():
             meant = difflib.get_close_matches(name.lower(), self.names(), 1)
             guess = f"; did you mean {meant[0]}?" if meant else ""

@@ -25,7 +25,7 @@ def adapted():
 
 @pytest.mark.parametrize(("options", "sentence"), [
     (dict(backend="gpu"), "there is no backend 'gpu'; choose from"),
-    (dict(backend=ReferenceBackend), "a backend is given by its name, got type"),
+    (dict(backend=ReferenceBackend), "backends are given by their names, got type"),
     (dict(threads=0), "threads must be at least 1, got 0"),
     (dict(threads="2"), "threads must be at least 1, got '2'"),
     (dict(cameras=""), "^cameras must be a text such as .*, got an empty text$"),
