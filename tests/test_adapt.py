@@ -197,6 +197,19 @@ def test_a_resumed_default_run_equals_an_uninterrupted_one(tmp_path, ctrl_c, nth
     assert [(p.step, p.psnr_db, p.gaussians) for p in resumed.report.curve] == [(p.step, p.psnr_db, p.gaussians) for p in whole.report.curve]
 
 
+def test_an_observer_may_interrupt_a_run(tmp_path):
+    """As Ctrl-C does, which may reach it twice, or by another way than ours."""
+
+    def observe(step, *_):
+        if step == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted, match=r"interrupted at step 3; run the same command again to continue from .*run.resume"):
+        wrapped().adapt(1 / 4, resume=tmp_path / "run.resume", observe=observe, **BRIEF)
+    resumed = wrapped().adapt(1 / 4, resume=tmp_path / "run.resume", **BRIEF)
+    assert torch.equal(shown(resumed), shown(wrapped().adapt(1 / 4, **BRIEF)))
+
+
 @pytest.mark.parametrize("nth", [2, 5])  # before and after splats were cloned
 @pytest.mark.parametrize("views", [1, 2])  # two share an activation
 def test_a_resumed_paper_run_equals_an_uninterrupted_one(tmp_path, ctrl_c, nth, views):

@@ -178,7 +178,10 @@ class Session:
 
         def after_step(run: Run) -> bool:
             keeper.save_if_due(run)
-            return is_true(observe and observe(run.step, run.watch.seconds, first.of_model(run.student)))
+            try:
+                return is_true(observe and observe(run.step, run.watch.seconds, first.of_model(run.student)))
+            except KeyboardInterrupt:
+                keeper.save_and_stop(run)
 
         if run.ended_by is None:
             task, config = within_budget(run, task, self.config)
