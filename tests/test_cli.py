@@ -378,6 +378,18 @@ def test_evaluate_prints_a_table_and_writes_its_rows(run, model_folder, tmp_path
     refused(run(*words), "rows.json exists already; pass --overwrite")
 
 
+def test_evaluate_says_where_a_file_is_adapted_to_images_of_another_filter_than_the_truths(run, model_folder, tmp_path):
+    scene = tiny.scene(tmp_path / "scene")
+    words = ["evaluate", model_folder, "--images", scene, "--scale", "1/2", "--recipe", "default", "--recipe", "instant", "--steps", "1"]
+    told = "P1 makes photographs smaller by another filter (box) than base images are for default (pil-bicubic); --resize area adapts to"
+    notes = []
+    for options in (["--protocol", "P1"], ["--protocol", "P1", "--resize", "area"], ["--protocol", "P3"]):
+        code, out, err = run(*words, *options, "--no-report", "--json")
+        assert code == 0, err
+        notes.append(json.loads(out)["notes"])
+    assert [len(each) for each in notes] == [1, 0, 0] and notes[0][0].startswith(told)
+
+
 def test_evaluate_as_json(run, model_folder, tmp_path):
     code, out, _ = run("evaluate", model_folder, "--images", tiny.scene(tmp_path / "scene"), "--scale", "1", "--json")
     assert code == 0 and json.loads(out)["rows"][0]["name"] == "base"
