@@ -245,6 +245,13 @@ def test_a_resumed_run_tells_the_seconds_of_both_processes(tmp_path, ctrl_c, mon
     assert first >= 200 and resumed.seconds["pseudo truth"] >= first + 100
 
 
+def test_a_run_ends_before_truths_that_its_time_budget_has_no_time_for(monkeypatch):
+    truth = Costs.truth
+    monkeypatch.setattr(Costs, "truth", lambda self, *request: (truth(self, *request), self.truths.__setitem__(request[0], 1e7))[0])
+    report = wrapped().adapt(1 / 4, **{**BRIEF, "time_budget_s": 1e6}).report
+    assert report.ended_by.startswith("time budget") and 0 < report.curve[-1].step < BRIEF["steps"]
+
+
 def test_a_resumed_run_goes_on_as_planned(tmp_path, ctrl_c, monkeypatch):
     """Of a time budget, also where the machine has become slower."""
     settings, paces = {**BRIEF, "time_budget_s": 1e6}, iter([Pace(1.0, 1.0, 1.0, 0.5), Pace(1e6, 1.0, 1.0)])
@@ -361,7 +368,7 @@ def test_the_choice_that_is_reserved_for_is_not_told_as_the_start(monkeypatch):
 
 
 def test_steps_that_were_planned_for_a_time_budget_are_told(monkeypatch):
-    monkeypatch.setattr(Pace, "of", classmethod(lambda *_: Pace(1e4, 0.0, 0.0)))
+    monkeypatch.setattr(Pace, "of", classmethod(lambda *_: Pace(6e3, 0.0, 0.0)))
     report = wrapped().adapt(1 / 4, time_budget_s=1e4, **BRIEF).report
     assert report.ended_by == "1 steps (planned for the time budget in place of 7)" and report.settings.steps == 7
 
