@@ -276,10 +276,10 @@ class FrozenBase:
         """What views without cameras go around. Raises SettingsError without splats."""
         return orbit_of(self.model, self.trained.up)
 
-    def refuse_undrawn(self, views: Sequence[Camera] | None = None) -> None:
-        """Raise SettingsError if none of the views, by default the base's own, shows anything of it (`refuse_blind`)."""
+    def refuse_undrawn(self, views: Sequence[Camera] | None = None, scale: float = 1.0) -> None:
+        """Raise SettingsError if none of the views, by default the base's own, shows anything of it at `scale` (`refuse_blind`)."""
         looked_from = self.views() if views is None else views
-        refuse_blind(looked_from, self.model, self.effects().near_plane, lambda view: self.render(view).image)
+        refuse_blind(looked_from, self.model, self.effects().near_plane, lambda view: self.render(view).image, scale)
 
     def place(self, scene: Scene) -> Scene:
         """Return the scene in the model's frame (`placed`); a checkpoint that came without cameras gets those of the scene."""

@@ -678,6 +678,18 @@ def test_a_scene_in_small_units_is_told_of_where_the_near_plane_keeps_an_orbit_a
         wrap_model(tiny.model(), cameras=[view.moved(far) for view in tiny.cameras(2)]).adapt(0.5, recipe="instant")
 
 
+@pytest.mark.parametrize("viewer", [None, "spark"])  # for which it is converted at x1 before
+def test_a_small_scene_may_be_zoomed_into(viewer):
+    far = torch.diag(torch.tensor([12.0, 12.0, 12.0, 1.0], dtype=torch.float64))
+    base = wrap_model(tiny.model(), cameras=[view.moved(far) for view in tiny.cameras(2)])
+    small = r"no view shows it larger than \d\S* px: the cameras seem to be in other units"
+    for scale in (0.5, 1.1):
+        with pytest.raises(SettingsError, match=small):
+            base.adapt(scale, steps=1, viewer=viewer)
+    with pytest.warns(UserWarning, match=small):
+        assert base.adapt(8, steps=1, viewer=viewer, extra_views=1).report.scale == 8
+
+
 def test_a_model_of_which_nothing_is_drawn_is_refused_and_one_of_which_little_is_is_not():
     faint = tiny.model()
     faint.parameters()["opacities"][:] = -8.0
