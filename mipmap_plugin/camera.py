@@ -92,7 +92,7 @@ class Camera:
 
         `K` and `others` as in `of_matrices`. Raises SettingsError, ShapeError.
         """
-        rows = 3 if hasattr(c2w, "__len__") and len(c2w) == 3 else 4
+        rows = 3 if getattr(c2w, "ndim", 2) and hasattr(c2w, "__len__") and len(c2w) == 3 else 4
         pose = torch.eye(4, dtype=torch.float64, device="cpu")
         pose[:rows] = _matrix("c2w", c2w, (rows, 4))
         if not pose.isfinite().all() or torch.linalg.det(pose) == 0:

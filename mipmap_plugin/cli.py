@@ -21,6 +21,7 @@ from mipmap_plugin.commands.inspect import inspect
 from mipmap_plugin.commands.levels import levels
 from mipmap_plugin.commands.list import list_
 from mipmap_plugin.commands.render import render
+from mipmap_plugin.commands.repeated import refuse_repeated
 from mipmap_plugin.commands.tradeoff import tradeoff
 from mipmap_plugin.commands.view import view
 from mipmap_plugin.errors import MipmapPluginError, of_a_file
@@ -34,11 +35,11 @@ DESCRIPTION = (
     "and --log FILE, to append all that is said, with further details, to a file."
 )
 
+COMMANDS = {command.__name__.rstrip("_"): command for command in (inspect, adapt, levels, render, view, evaluate, tradeoff, backends, list_, demo)}
+
 app = tyro.extras.SubcommandApp()
-for command in (inspect, adapt, levels, render, view, evaluate, tradeoff, backends):
-    app.command(command)
-app.command(name="list")(list_)
-app.command(demo)
+for name, command in COMMANDS.items():
+    app.command(name=name)(command)
 
 
 def _at_home(word: str) -> str:
@@ -71,6 +72,8 @@ def _run(words: Sequence[str]) -> int:
     """Run a command; return the exit code."""
     try:
         with _our_warnings_only(), ends_as_by_ctrl_c() as ending:
+            if words and words[0] in COMMANDS:
+                refuse_repeated(COMMANDS[words[0]], words)
             app.cli(prog="mipmap-plugin", description=DESCRIPTION, args=words)
     except BrokenPipeError:  # as of `| head`, whose reader wants no more
         return 141

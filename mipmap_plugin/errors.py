@@ -1,7 +1,9 @@
 """The exceptions. Every error that a user can cause is a `MipmapPluginError`, whose message says what is wrong, where, and what to do."""
 
+import difflib
 import errno
 import re
+from collections.abc import Sequence
 
 # Maximum characters of a message. A damaged file that it quotes may have megabytes in place of a name or a number.
 MAX_LENGTH = 1500
@@ -79,6 +81,23 @@ def of_a_file(error: OSError) -> str:
 def is_temporary(path: object) -> bool:
     """Whether a path leads into a temporary folder of this package, to whose name Python adds eight characters."""
     return re.search(rf"\b{TEMPORARY}[a-z0-9_]{{8}}\b", str(path)) is not None
+
+
+def with_article(noun: str) -> str:
+    """A noun behind its article: "an int", "a list"."""
+    return f"{'an' if noun[:1].lower() in 'aeio' else 'a'} {noun}"
+
+
+def type_of(value: object) -> str:
+    """The type of what was given in place of something else, behind its article."""
+    return with_article(type(value).__name__)
+
+
+def unknown(kind: str, name: str, names: Sequence[str]) -> str:
+    """That there is no such thing of a kind, which ones there are, and which was probably meant, in a sentence."""
+    meant = difflib.get_close_matches(name.lower(), names, 1)
+    guess = f"; did you mean {meant[0]}?" if meant else ""
+    return f"there is no {kind} {name!r}; choose from {', '.join(names)}{guess}"
 
 
 def brief(error: BaseException) -> str:

@@ -41,7 +41,7 @@ from mipmap_plugin.process.torch_modes import usual_modes
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.scenes.trajectories import Orbit
-from mipmap_plugin.screen_filters import DILATION, USUAL_EPS2D
+from mipmap_plugin.screen_filters import DILATION, USUAL_EPS2D, check_screen_filter
 from mipmap_plugin.splatting.filters import INTEGRALS
 from mipmap_plugin.splatting.viewers import find_viewer, own_name, viewers_for
 
@@ -85,11 +85,10 @@ class FrozenBase:
 
         `screen_filter`: None for the filter of its training, a filter's name, or "scaled" for the training-free filter whose dilation
         keeps its size in the world. Filters that integrate over the pixel dilate splats in this way too, because a classic model was
-        trained to look right with dilation. Raises SettingsError for an unknown viewer, and for a viewer together with a filter.
+        trained to look right with dilation. Raises SettingsError for an unknown viewer or filter, and for a viewer together with a filter.
         """
         check_kinds(screen_filter=(screen_filter, str))
-        trained = self.trained
-        degree = self._needs.sh_degree
+        trained, degree = self.trained, self._needs.sh_degree
         if viewer is not None:
             if screen_filter is not None:
                 raise SettingsError(f"viewer {viewer} has a screen filter of its own; leave the screen filter {screen_filter} out")
@@ -98,6 +97,7 @@ class FrozenBase:
         if screen_filter in (None, "scaled"):
             eps2d = trained.eps2d * (scale**2 if screen_filter == "scaled" else 1)
             return Effects(degree, trained.screen_filter, eps2d, self.background, supersampling, trained.near_plane)
+        check_screen_filter(screen_filter, "scaled", trained.screen_filter)
         eps2d = USUAL_EPS2D.get(screen_filter, DILATION)
         if screen_filter in INTEGRALS and trained.screen_filter == "classic":
             eps2d = trained.eps2d * scale**2
@@ -276,10 +276,10 @@ class FrozenBase:
         """What views without cameras go around. Raises SettingsError without splats."""
         return orbit_of(self.model, self.trained.up)
 
-    def refuse_undrawn(self, views: Sequence[Camera] | None = None) -> None:
-        """Raise SettingsError if none of the views, by default the base's own, shows anything of it (`refuse_blind`)."""
+    def refuse_undrawn(self, views: Sequence[Camera] | None = None, scale: float = 1.0) -> None:
+        """Raise SettingsError if none of the views, by default the base's own, shows anything of it at `scale` (`refuse_blind`)."""
         looked_from = self.views() if views is None else views
-        refuse_blind(looked_from, self.model, self.effects().near_plane, lambda view: self.render(view).image)
+        refuse_blind(looked_from, self.model, self.effects().near_plane, lambda view: self.render(view).image, scale)
 
     def place(self, scene: Scene) -> Scene:
         """Return the scene in the model's frame (`placed`); a checkpoint that came without cameras gets those of the scene."""

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from mipmap_plugin.config import AdaptConfig, LearningRates, allowed
-from mipmap_plugin.errors import PluginError, SettingsError
+from mipmap_plugin.errors import PluginError, SettingsError, type_of
 from mipmap_plugin.limits import check_scale
 from mipmap_plugin.registry import Registry
 
@@ -161,7 +161,7 @@ def _told(error: Any, given: Mapping[str, Any]) -> str:
         return f"there is no setting {name}; {f'did you mean {meant[0]}? ' if meant else ''}mipmap_plugin.config has all of them"
     own = str(error["ctx"]["error"]) if error["type"] == "value_error" else f"must be {allowed(name)}"
     said = repr(got)
-    return f"setting {name}: {own}, got {said if len(said) <= LONGEST else f'a {type(got).__name__}'}"
+    return f"setting {name}: {own}, got {said if len(said) <= LONGEST else type_of(got)}"
 
 
 def scale_of_fraction(kept: float) -> float:

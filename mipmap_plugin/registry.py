@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import os
 import sys
@@ -12,7 +11,7 @@ from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from mipmap_plugin.errors import PluginError, SettingsError
+from mipmap_plugin.errors import PluginError, SettingsError, unknown
 
 
 class Registry:
@@ -49,13 +48,13 @@ class Registry:
 
     def get(self, name: str) -> Any:
         """Return the object of that name. Raises SettingsError for an unknown name, PluginError for a broken target."""
-        kind = self.group.rpartition(".")[2].removesuffix("s")
+        kinds = self.group.rpartition(".")[2]
+        kind = kinds.removesuffix("s")
         if not isinstance(name, str):  # most often the plug-in itself
-            raise SettingsError(f"a {kind} is given by its name, got {type(name).__name__}; register your own first, by register_{kind}(name, ...)")
+            own = f"register your own first, by register_{kind}(name, ...)"
+            raise SettingsError(f"{kinds} are given by their names, got {type(name).__name__}; {own}")
         if name not in self._targets and name not in self._installed():
-            meant = difflib.get_close_matches(name.lower(), self.names(), 1)
-            guess = f"; did you mean {meant[0]}?" if meant else ""
-            raise SettingsError(f"there is no {kind} {name!r}; choose from {', '.join(self.names())}{guess}")
+            raise SettingsError(unknown(kind, name, self.names()))
         target = self._targets[name] if name in self._targets else self._installed()[name]
         return load_target(name, target) if isinstance(target, str) else target
 

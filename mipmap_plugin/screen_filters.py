@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from mipmap_plugin.errors import SettingsError, unknown
+
 # px²: the variance that every 3DGS rasterizer adds to a projected splat (diff-gaussian-rasterization, forward.cu).
 DILATION = 0.3
 
@@ -40,3 +42,10 @@ assert tuple(SCREEN_FILTERS) == get_args(Name) and set(get_args(TrainedName)) <=
 INTEGRATED = frozenset(name for name, screen_filter in SCREEN_FILTERS.items() if screen_filter.integrates)
 COMPENSATED = frozenset(name for name, screen_filter in SCREEN_FILTERS.items() if screen_filter.min_compensation < 1)
 USUAL_EPS2D = {name: screen_filter.eps2d for name, screen_filter in SCREEN_FILTERS.items()}
+
+
+def check_screen_filter(name: str, *others: str) -> None:
+    """Raise SettingsError for a name that is none of a screen filter, nor of `others` that may stand in its place."""
+    names = dict.fromkeys((*others, *SCREEN_FILTERS))
+    if name not in names:
+        raise SettingsError(unknown("screen filter", name, [*names]))

@@ -20,7 +20,7 @@ from mipmap_plugin.camera import Camera, digest_of, of_base_scale
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.frozen_base import RenderOptions as RenderOptions
-from mipmap_plugin.limits import check_background, check_names
+from mipmap_plugin.limits import check_background, check_kinds, check_names, path_of
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.adapted_scale import known_up
 from mipmap_plugin.models.base import SplatModel
@@ -30,7 +30,7 @@ from mipmap_plugin.process.threads import checked as checked_threads
 from mipmap_plugin.process.torch_modes import usual_modes
 from mipmap_plugin.scenes import Scene, load_scene
 from mipmap_plugin.scenes.trajectories import AXES
-from mipmap_plugin.screen_filters import USUAL_EPS2D
+from mipmap_plugin.screen_filters import USUAL_EPS2D, check_screen_filter
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -89,8 +89,8 @@ def wrap_model(
     vertical = known_up(model.source, model.trained.up) if up is None else axis_of(up)
     trained = replace(model.trained, background=color or model.trained.background, up=vertical)
     if screen_filter is not None:
-        if not isinstance(screen_filter, str) or screen_filter not in USUAL_EPS2D:
-            raise SettingsError(f"there is no screen filter {screen_filter!r}; choose from {', '.join(USUAL_EPS2D)}")
+        check_kinds(screen_filter=(screen_filter, str))
+        check_screen_filter(screen_filter)
         trained = replace(trained, screen_filter=screen_filter, eps2d=USUAL_EPS2D[screen_filter])
     found, read_from = _found(model, cameras)
     given = found.cameras if isinstance(found, Scene) else found
@@ -119,7 +119,7 @@ def check_serves(backend: str, threads: int | None) -> None:
 def _found(model: SplatModel, cameras: Sequence[Camera] | Scene | str | Path | None) -> tuple[Sequence[Camera] | Scene, dict[str, str]]:
     """The cameras that are given, those beside the model's file, or, of an adapted file, those of its base; and `where` they were read from."""
     if isinstance(cameras, (str, Path)):
-        cameras = load_scene(cameras, read_options(model.folder)[0])
+        cameras = load_scene(path_of(cameras, "cameras"), read_options(model.folder)[0])
     if isinstance(cameras, Scene):
         return cameras, where(cameras.source, model.folder)
     if cameras is not None:

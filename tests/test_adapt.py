@@ -197,6 +197,19 @@ def test_a_resumed_default_run_equals_an_uninterrupted_one(tmp_path, ctrl_c, nth
     assert [(p.step, p.psnr_db, p.gaussians) for p in resumed.report.curve] == [(p.step, p.psnr_db, p.gaussians) for p in whole.report.curve]
 
 
+def test_an_observer_may_interrupt_a_run(tmp_path):
+    """As Ctrl-C does, which may reach it twice, or by another way than ours."""
+
+    def observe(step, *_):
+        if step == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted, match=r"interrupted at step 3; run the same command again to continue from .*run.resume"):
+        wrapped().adapt(1 / 4, resume=tmp_path / "run.resume", observe=observe, **BRIEF)
+    resumed = wrapped().adapt(1 / 4, resume=tmp_path / "run.resume", **BRIEF)
+    assert torch.equal(shown(resumed), shown(wrapped().adapt(1 / 4, **BRIEF)))
+
+
 @pytest.mark.parametrize("nth", [2, 5])  # before and after splats were cloned
 @pytest.mark.parametrize("views", [1, 2])  # two share an activation
 def test_a_resumed_paper_run_equals_an_uninterrupted_one(tmp_path, ctrl_c, nth, views):
@@ -230,6 +243,13 @@ def test_a_resumed_run_tells_the_seconds_of_both_processes(tmp_path, ctrl_c, mon
     first = load_torch(tmp_path / "state")["costs"][0]
     resumed = wrapped().adapt(1 / 4, resume=tmp_path / "state", **BRIEF).report
     assert first >= 200 and resumed.seconds["pseudo truth"] >= first + 100
+
+
+def test_a_run_ends_before_truths_that_its_time_budget_has_no_time_for(monkeypatch):
+    truth = Costs.truth
+    monkeypatch.setattr(Costs, "truth", lambda self, *request: (truth(self, *request), self.truths.__setitem__(request[0], 1e7))[0])
+    report = wrapped().adapt(1 / 4, **{**BRIEF, "time_budget_s": 1e6}).report
+    assert report.ended_by.startswith("time budget") and 0 < report.curve[-1].step < BRIEF["steps"]
 
 
 def test_a_resumed_run_goes_on_as_planned(tmp_path, ctrl_c, monkeypatch):
@@ -348,7 +368,7 @@ def test_the_choice_that_is_reserved_for_is_not_told_as_the_start(monkeypatch):
 
 
 def test_steps_that_were_planned_for_a_time_budget_are_told(monkeypatch):
-    monkeypatch.setattr(Pace, "of", classmethod(lambda *_: Pace(1e4, 0.0, 0.0)))
+    monkeypatch.setattr(Pace, "of", classmethod(lambda *_: Pace(6e3, 0.0, 0.0)))
     report = wrapped().adapt(1 / 4, time_budget_s=1e4, **BRIEF).report
     assert report.ended_by == "1 steps (planned for the time budget in place of 7)" and report.settings.steps == 7
 
@@ -419,8 +439,8 @@ def test_double_precision_adapts_in_double_precision():
         (dict(recipe="best"), "there is no recipe 'best'; choose from default, instant, paper, thorough"),
         (dict(stepz=3), r"there is no setting stepz; did you mean steps\? mipmap_plugin.config has all of them"),
         (dict(recipe="defualt"), r"there is no recipe 'defualt'; choose from .*; did you mean default\?"),
-        (dict(recipe=print), r"^a recipe is given by its name, got builtin_function_or_method; register your own first, by register_recipe"),
-        (dict(viewer=["spark", "three"]), "^a viewer is given by its name, got list; register your own first, by register_viewer"),
+        (dict(recipe=print), r"^recipes are given by their names, got builtin_function_or_method; register your own first, by register_recipe"),
+        (dict(viewer=["spark", "three"]), "^viewers are given by their names, got list; register your own first, by register_viewer"),
         (dict(upsampler=print), "^setting upsampler: must be the name of an upsampler, which register_upsampler gives to a function, got "),
         (dict(upsampler=Path("nowhere.pth")), "^there is no upsampler file nowhere.pth"),
         (dict(views=[tiny.cameras(1)[0]] * 3), "^setting views: must be 'given', .* or 'jittered', got a list$"),
@@ -656,6 +676,18 @@ def test_a_scene_in_small_units_is_told_of_where_the_near_plane_keeps_an_orbit_a
     with pytest.raises(SettingsError, match="the cameras seem to be in other units"):
         far = torch.diag(torch.tensor([100.0, 100.0, 100.0, 1.0], dtype=torch.float64))
         wrap_model(tiny.model(), cameras=[view.moved(far) for view in tiny.cameras(2)]).adapt(0.5, recipe="instant")
+
+
+@pytest.mark.parametrize("viewer", [None, "spark"])  # for which it is converted at x1 before
+def test_a_small_scene_may_be_zoomed_into(viewer):
+    far = torch.diag(torch.tensor([12.0, 12.0, 12.0, 1.0], dtype=torch.float64))
+    base = wrap_model(tiny.model(), cameras=[view.moved(far) for view in tiny.cameras(2)])
+    small = r"no view shows it larger than \d\S* px: the cameras seem to be in other units"
+    for scale in (0.5, 1.1):
+        with pytest.raises(SettingsError, match=small):
+            base.adapt(scale, steps=1, viewer=viewer)
+    with pytest.warns(UserWarning, match=small):
+        assert base.adapt(8, steps=1, viewer=viewer, extra_views=1).report.scale == 8
 
 
 def test_a_model_of_which_nothing_is_drawn_is_refused_and_one_of_which_little_is_is_not():

@@ -7,7 +7,7 @@ import pytest
 import torch
 from tiny import cameras, gaussians, model
 
-from mipmap_plugin.adaptation.start.blend_weights import _color_gradient, blend_weights, may_show, whole_weights
+from mipmap_plugin.adaptation.start.blend_weights import _color_gradient, blend_weights, may_show, weighed, whole_weights
 from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
@@ -35,6 +35,13 @@ def test_the_sum_of_blend_weights_is_what_the_background_lacks(backend):
     splats, views = model(60).gaussians().detach(), cameras(3)
     filled = torch.stack([opacity(splats, view).sum() for view in views]).mean()
     torch.testing.assert_close(blend_weights(splats, views, backend, Effects(1)).sum(), filled, rtol=1e-4, atol=0.0)
+
+
+def test_blend_weights_are_the_same_in_smaller_views(backend):
+    splats, views = model(60).gaussians().detach(), [view.zoomed(4) for view in cameras(3)]
+    whole, shown = weighed(splats, views, backend, Effects(1))
+    smaller, also_shown = weighed(splats, views, backend, Effects(1), size=1 / 4)
+    assert float((smaller - whole).abs().sum() / whole.sum()) < 0.06 and also_shown == pytest.approx(shown, abs=0.05)
 
 
 def test_a_splat_alone_fills_what_it_covers():

@@ -1,5 +1,6 @@
 """A run with a time budget has as many steps and views as fit into it."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -23,7 +24,7 @@ PACE = Pace(a_view=0.01, a_truth=0.02, a_check=0.05, a_choice=0.25)
 
 @pytest.fixture(autouse=True)
 def known_pace(monkeypatch):
-    monkeypatch.setattr(Pace, "of", classmethod(lambda cls, student, task: PACE))
+    monkeypatch.setattr(Pace, "of", classmethod(lambda cls, student, task, size, left: PACE))
 
 
 def a_task(views: int) -> Task:
@@ -114,6 +115,27 @@ def test_what_needs_no_change_has_none(settings, seconds):
     task, config = a_task(4), recipe("default", 1 / 4, **settings)
     same, unchanged = within_budget(a_run(seconds), task, config)
     assert unchanged == config and same.views == task.views
+
+
+def test_a_step_that_does_not_fit_is_not_begun(monkeypatch):
+    """As of very large views, of which a truth alone takes longer than is left."""
+    monkeypatch.setattr(Pace, "of", classmethod(lambda cls, *_: Pace(a_view=1.0, a_truth=8.0, a_check=0.1, a_choice=0.25)))
+    run, config = a_run(1.0), recipe("default", 1 / 4, time_budget_s=10.0)
+    run.curve = [CurvePoint(step=0, seconds=1.0, psnr_db=None, validation_db=20.0, gaussians=5)]
+    within_budget(run, a_task(4), config)
+    assert run.reason_to_stop(config) is End.CHOICE and run.reserved == 9.25
+
+
+def test_of_large_views_nothing_is_drawn_that_takes_longer_than_is_left(monkeypatch):
+    monkeypatch.undo()
+    drawn = []
+    monkeypatch.setattr(budget, "_seconds", lambda function, camera, device: (drawn.append(camera.size), 0.01)[1])
+    large = [camera.resized(8 * budget.WINDOW, 4 * budget.WINDOW) for camera in tiny.cameras(2)]
+    task = replace(a_task(2), views=large, scale=1.0)
+    pace = Pace.of(tiny.model(5), task, left=0.3)
+    assert drawn == [(budget.WINDOW, budget.WINDOW)]  # the middle of one
+    assert pace.a_view == pytest.approx(0.01 * 32 * budget.STEP_OVER_IMAGE)
+    assert pace.a_truth == pytest.approx(0.01 * 32 * budget.TRUTH_OVER_IMAGE)
 
 
 def test_the_pace_is_measured_in_images_and_truths(monkeypatch):

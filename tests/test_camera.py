@@ -152,6 +152,7 @@ def test_poses_of_opengl_look_at_the_same(camera, rows):
     (lambda: Camera.of_matrices(VIEWMAT, K + np.eye(3, k=1), 64, 48), "K: a pinhole has no skew, got 1"),
     (lambda: Camera.of_matrices(VIEWMAT, K.T, 64, 48), "K: the last row must be 0 0 1, got .*; it may have to be transposed"),
     (lambda: Camera.of_opengl(None, K, 64, 48), "c2w: expected a tensor or an array"),
+    (lambda: Camera.of_opengl(torch.tensor(3.0), K, 64, 48), r"c2w: expected shape \[4, 4\], got \[\]"),
     (lambda: Camera.of_opengl(np.zeros((4, 4)), K, 64, 48), "c2w: the pose .* cannot be inverted"),
 ])  # fmt: skip
 def test_matrices_of_no_camera_are_named(make, sentence):

@@ -380,6 +380,18 @@ def test_evaluate_prints_a_table_and_writes_its_rows(run, model_folder, tmp_path
     refused(run(*words), "rows.json exists already; pass --overwrite")
 
 
+def test_evaluate_says_where_a_file_is_adapted_to_images_of_another_filter_than_the_truths(run, model_folder, tmp_path):
+    scene = tiny.scene(tmp_path / "scene")
+    words = ["evaluate", model_folder, "--images", scene, "--scale", "1/2", "--recipe", "default", "--recipe", "instant", "--steps", "1"]
+    told = "P1 makes photographs smaller by another filter (box) than base images are for default (pil-bicubic); --resize area adapts to"
+    notes = []
+    for options in (["--protocol", "P1"], ["--protocol", "P1", "--resize", "area"], ["--protocol", "P3"]):
+        code, out, err = run(*words, *options, "--no-report", "--json")
+        assert code == 0, err
+        notes.append(json.loads(out)["notes"])
+    assert [len(each) for each in notes] == [1, 0, 0] and notes[0][0].startswith(told)
+
+
 def test_evaluate_as_json(run, model_folder, tmp_path):
     code, out, _ = run("evaluate", model_folder, "--images", tiny.scene(tmp_path / "scene"), "--scale", "1", "--json")
     assert code == 0 and json.loads(out)["rows"][0]["name"] == "base"
@@ -420,6 +432,14 @@ def test_evaluate_averages_several_scenes_and_prints_the_published_rows(run, mod
     assert "| one       | x0.25 | P3 " in out and "| mean of 2 | x0.25 | P3 " in out
     assert "published, mean over the 8 scenes of NeRF-Synthetic" in out and "Mipmap-GS (arXiv 2408.06286)" in out
     refused(run("evaluate", model_folder, "--images", *scenes, "--scale", "1/4"), "--images: give one for each checkpoint", "; got 2, for 1 of these")
+
+
+def test_an_option_that_counts_once_is_not_given_twice(run, model_folder, tmp_path):
+    scenes = [tiny.scene(tmp_path / "one"), tiny.scene(tmp_path / "two")]
+    twice = ["--images", scenes[0], f"--images={scenes[1]}"]
+    refused(run("evaluate", model_folder, *twice, "--scale", "1/4"), "--images is given 2 times", "; give it once, with all its values behind it\n")
+    budgets = ["--time-budget-s", "1", "--time_budget_s", "2"]
+    refused(run("adapt", model_folder, "--scale", "1/4", *budgets), "--time-budget-s is given 2 times", "; give it once\n")
 
 
 def test_a_lone_file_is_judged_by_photographs_with_the_cameras_that_are_given(run, tmp_path):

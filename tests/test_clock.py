@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import tiny
 import torch
 
 from mipmap_plugin.adaptation.optimization.estimate import Costs
-from mipmap_plugin.adaptation.start import candidates
-from mipmap_plugin.adaptation.start.candidates import _Clock
+from mipmap_plugin.adaptation.start import clock as clock_module
+from mipmap_plugin.adaptation.start.clock import Clock
 from mipmap_plugin.process.clock import now
 
 GPU = torch.device("cuda")
@@ -39,16 +41,30 @@ def test_truths_and_checks_cost_until_the_gpu_has_made_them(waited):
 
 
 def test_a_start_counts_the_work_of_a_gpu(waited):
-    clock = _Clock(100.0, GPU)
+    clock = Clock(100.0, GPU)
     with clock.timing("weights"):
         pass
     assert clock.allows("weights") and waited == [GPU] * 4
 
 
+@pytest.mark.parametrize(("end", "size"), [(1e9, 1.0), (1.0 + 3 * 12 * 4.0, 0.25), (1.0, 0.125)])  # seconds
+def test_large_views_are_weighed_at_a_size_that_a_start_has_time_for(monkeypatch, end, size):
+    """Where one of 1000 px takes a second."""
+    seconds, tried = iter([0.0, 0.0, 1.0, 1.0]), []
+    monkeypatch.setattr(clock_module, "now", lambda device: next(seconds))
+    assert Clock(end, torch.device("cpu")).size(tiny.cameras(1)[0].resized(8000, 8000), 12, tried.append) == pytest.approx(size)
+    assert tried == [0.125]
+
+
+@pytest.mark.parametrize(("seconds", "pixels"), [(math.inf, 8000), (0.1, 1000)])
+def test_views_are_weighed_as_they_are_without_a_budget_and_where_they_are_small(seconds, pixels):
+    assert Clock(seconds, torch.device("cpu")).size(tiny.cameras(1)[0].resized(pixels, pixels), 12, pytest.fail) == 1.0
+
+
 def test_a_start_expects_a_candidate_of_fewer_splats_to_take_less_time(monkeypatch):
     seconds = iter([0.0, 0.0, 2.0, 2.0, 2.0])  # of a candidate of half of the splats, in a start of three
-    monkeypatch.setattr(candidates, "now", lambda device: next(seconds))
-    clock = _Clock(3.0, torch.device("cpu"))
+    monkeypatch.setattr(clock_module, "now", lambda device: next(seconds))
+    clock = Clock(3.0, torch.device("cpu"))
     with clock.timing("candidate", 0.5):
         pass
     assert clock.allows("candidate", 0.25) and not clock.allows("candidate", 0.3)

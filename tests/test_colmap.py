@@ -51,6 +51,19 @@ def test_a_camera_is_where_colmap_says(tmp_path):
     assert torch.equal(scene.points, torch.tensor([[0.0, 2, 3], [1, 2, 3], [2, 2, 3]], dtype=torch.float64))
 
 
+def test_names_of_images_may_have_blanks(tmp_path):
+    """In COLMAP's text too, where they are the rest of the line; below each image are its points, of which there may be none."""
+    photographs = ["my photo  1.png", "left/my photo 2.png", "3.png"]
+    write_text_model(tmp_path / "sparse/0", photographs)
+    text = (tmp_path / "sparse/0/images.txt").read_text()
+    (tmp_path / "sparse/0/images.txt").write_text("# Image list\n" + text.replace("1.png\n\n", "1.png\n1 2 -1 3 4 -1\n") + "\n")
+    write_photographs(tmp_path / "images", photographs)
+    scene = load_scene(tmp_path)
+    assert {camera.name: file.name for camera, file in scene.images.items()} == {
+        "3": "3.png", "left/my photo 2": "my photo 2.png", "my photo  1": "my photo  1.png",
+    }  # fmt: skip
+
+
 def test_every_eighth_of_the_sorted_names_is_a_test_view(tmp_path):
     write_text_model(tmp_path / "sparse/0", names(20))
     scene = load_scene(tmp_path)

@@ -45,7 +45,7 @@ LINK = re.compile(r"\]\(([^)\s]+)\)")
 SNIPPET = re.compile(r'^--8<-- "([^":]+)(?::(\w+))?"$', re.MULTILINE)
 OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]*")
 
-COMMANDS = {each.__name__.rstrip("_"): each for each in vars(cli).values() if getattr(each, "__module__", "").startswith("mipmap_plugin.commands.")}
+COMMANDS = cli.COMMANDS
 OTHER_PROGRAMS = {"pip", "python", "pytest", "ruff", "mypy", "npm", "mkdocs", "dask", "sbatch"}
 OPTIONS_OF_OTHERS = {"--train_test_exp", "--antialiasing", "--resources"}  # INRIA's; dask's
 

@@ -124,7 +124,7 @@ class Anchors:
         ({name: tensor for name, tensor in splats().items() if name != "shN"}, r"shN is empty, \[N, 0, 3\]\), and this one lacks shN$"),
         ({**splats(), "features": torch.zeros(30, 32)}, r"and this one has features besides$"),
         (wrap_model(splats()), "a Wrapped is not a known kind of model; give its attribute `model`$"),
-        (7, "a int is not a known kind of model; give a path"),
+        (7, "an int is not a known kind of model; give a path"),
     ],
 )
 def test_other_objects_are_refused_in_one_sentence(thing, sentence):

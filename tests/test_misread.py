@@ -39,7 +39,7 @@ def test_octree_anygs_is_refused_by_name(tmp_path, columns):
     """Its explicit models have all columns of 3DGS, and further ones that change the splats."""
     path = write(tmp_path / "a.ply", columns)
     assert detect(path).family == "anygs"
-    with pytest.raises(CheckpointError, match="Octree-AnyGS"):
+    with pytest.raises(CheckpointError, match="this is an Octree-AnyGS checkpoint"):
         load_model(path)
 
 

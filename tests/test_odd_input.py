@@ -27,13 +27,14 @@ def adapted():
 
 @pytest.mark.parametrize(("options", "sentence"), [
     (dict(backend="gpu"), "there is no backend 'gpu'; choose from"),
-    (dict(backend=ReferenceBackend), "a backend is given by its name, got type"),
+    (dict(backend=ReferenceBackend), "backends are given by their names, got type"),
     (dict(threads=0), "threads must be at least 1, got 0"),
     (dict(threads="2"), "threads must be at least 1, got '2'"),
+    (dict(cameras=""), "^cameras must be a text such as .*, got an empty text$"),
 ])  # fmt: skip
 def test_a_model_is_not_wrapped_with_what_cannot_draw_it(options, sentence):
     with pytest.raises(SettingsError, match=sentence):
-        wrap_model(tiny.model(5), cameras=tiny.cameras(), **options)
+        wrap_model(tiny.model(5), **{"cameras": tiny.cameras(), **options})
 
 
 def test_cameras_may_be_a_path(tmp_path):

@@ -243,7 +243,7 @@ def test_a_module_that_ends_the_process_is_a_broken_target(tmp_path, monkeypatch
 def test_a_name_is_a_text(name):
     with pytest.raises(SettingsError, match="a name is a text"):
         BACKENDS.add(name, Slow)
-    with pytest.raises(SettingsError, match=r"^a backend is given by its name, got \w+; register your own first, by register_backend\(name"):
+    with pytest.raises(SettingsError, match=r"^backends are given by their names, got \w+; register your own first, by register_backend\(name"):
         BACKENDS.get(name)
 
 

@@ -8,6 +8,7 @@ import zlib
 
 import numpy as np
 import pytest
+import tiny
 import torch
 from PIL import Image
 
@@ -366,6 +367,11 @@ def test_cameras_in_formats_that_are_not_read_are_refused(tmp_path, name):
     (tmp_path / name).write_text("<document/>")
     with pytest.raises(SceneError, match=rf"{name}: is no file of cameras that is read here .*; export them as one of these"):
         load_scene(tmp_path / name)
+
+
+def test_a_file_of_splats_is_no_scene(tmp_path):
+    with pytest.raises(SceneError, match=r"a.ply: is no file of cameras .*; this PLY has no camera in it: give the cameras of its scene$"):
+        load_scene(tiny.ply(tmp_path / "a.ply"))
 
 
 def test_a_file_of_a_colmap_model_names_its_folder(tmp_path):

@@ -55,6 +55,7 @@ class Session:
 
     notes: Sequence[str] = ()  # on what the views show of the base
     ended: End | None = None  # why the steps ended
+    wanted: float | None = None  # the scale that is wanted in the end, where this is the conversion before
     keeps_state = False  # whether the state of a run that has ended is kept too: because another one starts from what it returns
 
     def __init__(self, request: AdaptationRequest, scale: float, config: AdaptConfig, cameras: list[Camera], real: Photographs | None) -> None:
@@ -101,7 +102,7 @@ class Session:
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
         """Adapt the base, or continue the run that `resume` holds, and return the best state."""
         near, few = self.base_effects.near_plane, len(self.base.parameters()["means"]) <= (self.config.most_splats or sys.maxsize)
-        refuse_blind(self.base_views, self.base, near, self.truth)
+        refuse_blind(self.base_views, self.base, near, self.truth, self.wanted or self.scale)
         if self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values()):
             copy, reason = self._for_target(self.base), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
@@ -178,7 +179,10 @@ class Session:
 
         def after_step(run: Run) -> bool:
             keeper.save_if_due(run)
-            return is_true(observe and observe(run.step, run.watch.seconds, first.of_model(run.student)))
+            try:
+                return is_true(observe and observe(run.step, run.watch.seconds, first.of_model(run.student)))
+            except KeyboardInterrupt:
+                keeper.save_and_stop(run)
 
         if run.ended_by is None:
             task, config = within_budget(run, task, self.config)

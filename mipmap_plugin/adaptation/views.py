@@ -178,16 +178,16 @@ def _inside(views: Sequence[Camera], means: Tensor, near: float) -> Iterator[Ten
         yield view.in_picture(view.to_camera(means.detach()), near)
 
 
-def refuse_blind(views: Sequence[Camera], model: SplatModel, near: float, image_of: Callable[[Camera], Tensor]) -> None:
+def refuse_blind(views: Sequence[Camera], model: SplatModel, near: float, image_of: Callable[[Camera], Tensor], scale: float = 1.0) -> None:
     """Raise SettingsError for views that show nothing, or a speck: of cameras of another scene, or of splats that no renderer draws, for example.
 
-    `near`: the near plane, in world units; `image_of`: a view's image [h, w, 3].
+    `near`: the near plane, in world units; `image_of`: a view's image [h, w, 3]; `scale`: that is wanted, for a zoom-in makes specks large.
     """
     some, means = evenly(views, LOOKED_AT), model.parameters()["means"]
     if not showing(some, means, near):  # a few of many cameras may see what is left of a scene that was cut down
         some = evenly(showing(views, means, near), LOOKED_AT) or some
     if any(_draws(view, model, near) for view in some):
-        if small := too_small(views, model, near, min(LEAST_PIXELS, LEAST_SHARE * min(views[0].size))):
+        if small := too_small(views, model, near, min(LEAST_PIXELS, LEAST_SHARE * min(views[0].size)) / max(1.0, scale)):
             raise SettingsError(small)
         return
     if all(torch.equal(image, image[:1, :1].expand_as(image)) for image in map(image_of, some)):  # nor a splat whose center lies outside

@@ -11,7 +11,7 @@ import torch
 
 from mipmap_plugin.backends.base import API_VERSION, Backend, Needs
 from mipmap_plugin.backends.guarded import Guarded
-from mipmap_plugin.errors import BackendUnavailable, PluginError
+from mipmap_plugin.errors import BackendUnavailable, PluginError, type_of
 from mipmap_plugin.plugin_errors import is_third_party
 from mipmap_plugin.registry import Registry
 
@@ -112,7 +112,7 @@ def _lacking(name: str, backend: Backend, needs: Sequence[Needs]) -> list[str]:
     except (Exception, SystemExit) as error:  # as in `get_backend`
         raise PluginError(f"backend {name!r} cannot say what it lacks: {type(error).__name__}: {error}") from error
     if wrong := [answer for answer in answers if not isinstance(answer, (list, tuple))]:
-        raise PluginError(f"backend {name!r}: lacking() has to return a list of sentences; it returned a {type(wrong[0]).__name__}")
+        raise PluginError(f"backend {name!r}: lacking() has to return a list of sentences; it returned {type_of(wrong[0])}")
     return list(dict.fromkeys(str(reason) for answer in answers for reason in answer))
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from mipmap_plugin.backends.base import AdamStep, Calls, Needs, Rendered, Stepper
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.errors import PluginError
+from mipmap_plugin.errors import PluginError, type_of
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.plugin_errors import naming, unchanged
 
@@ -45,7 +45,7 @@ class Guarded:
         image, wanted = getattr(rendered, "image", None), (*camera.size, 3)
         if not isinstance(rendered, Rendered) or not isinstance(image, Tensor) or tuple(image.shape) != wanted:
             thing = image if isinstance(rendered, Rendered) else rendered
-            got = f"an image {list(image.shape)}" if isinstance(image, Tensor) else f"a {type(thing).__name__}"
+            got = f"an image {list(image.shape)}" if isinstance(image, Tensor) else type_of(thing)
             raise PluginError(f"{self._title} has to return a Rendered with an image {list(wanted)}; it returned {got}")
         if image.dtype != gaussians.means.dtype:
             raise PluginError(f"{self._title} has to return images of the splats' type {gaussians.means.dtype}; it returned {image.dtype}")
@@ -62,7 +62,7 @@ class Guarded:
         with naming(self._title):
             alpha = rendered.alpha
         if not isinstance(alpha, Tensor) or tuple(alpha.shape) != wanted:
-            got = list(alpha.shape) if isinstance(alpha, Tensor) else f"a {type(alpha).__name__}"
+            got = list(alpha.shape) if isinstance(alpha, Tensor) else type_of(alpha)
             raise PluginError(f"{self._title} has to return an alpha {list(wanted)}; it returned {got}")
         return alpha
 
@@ -71,7 +71,7 @@ class Guarded:
         with naming(self._title), unchanged(self._title, _tensors(gaussians)):
             views = theirs(watched, shots)
         if not isinstance(views, (list, tuple)) or len(views) != len(shots):
-            got = f"{len(views)}" if isinstance(views, (list, tuple)) else f"a {type(views).__name__}"
+            got = f"{len(views)}" if isinstance(views, (list, tuple)) else type_of(views)
             raise PluginError(f"{self._title}: render_views has to return a list of {len(shots)} Rendered, one for each view; it returned {got}")
         return [self._checked(view, gaussians, *shot) for view, shot in zip(views, shots, strict=True)]
 

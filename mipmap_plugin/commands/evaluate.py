@@ -16,6 +16,7 @@ from mipmap_plugin.commands.pages import evaluation_gallery, evaluation_page_pat
 from mipmap_plugin.commands.resuming import resumable, resume_path
 from mipmap_plugin.commands.types import BackendName, Background, Scales, ScreenFilter, Seed, Threads, unique_scales
 from mipmap_plugin.commands.voice import say
+from mipmap_plugin.config import ResizeFilter
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, write_json
 from mipmap_plugin.jobs.base import Base
@@ -38,6 +39,7 @@ def evaluate(
     published: Literal["nerf-synthetic", "mip-nerf-360"] | None = None,
     steps: int | None = None,
     upsampler: str | None = None,
+    resize: ResizeFilter | None = None,
     appearance: Literal["mean", "upstream"] = "mean",
     cameras: tuple[Path, ...] = (),
     background: Background = None,
@@ -64,6 +66,7 @@ def evaluate(
         published: Also print the results that papers published for this data set.
         steps: Maximum number of optimizer steps, instead of the recipe's; a recipe without steps takes none.
         upsampler: What makes base images larger: a registered name, or the file of a network.
+        resize: Filter that makes base images smaller, instead of the recipe's: area aims at P1, pil-bicubic at P3.
         appearance: Appearance of test views, if training views have their own: mean of these, or upstream (of the view with the same number).
         cameras: Cameras of the base scale, one scene or cameras.json for each checkpoint, if there are none beside it, as of lone files; may be
             the folder of the images, if it was trained on these at their size.
@@ -74,7 +77,7 @@ def evaluate(
     """
     page = evaluation_page_path(checkpoint[0], output) if report else None
     _refuse(checkpoint, images, cameras, [path for path in (output, page) if path], overwrite)
-    settings = without_none(seed=seed, steps=steps, upsampler=upsampler, viewer=viewer)
+    settings = without_none(seed=seed, steps=steps, upsampler=upsampler, resize=resize, viewer=viewer)
     results = _Results(protocol, _perceptual(lpips, lpips_weights), unique_scales(scale), page, output)
     with results.resumable():
         for path, folder, own in zip(checkpoint, images, cameras or [None] * len(checkpoint), strict=True):
@@ -111,7 +114,8 @@ class _Results:
         gallery = evaluation_gallery(wrapped, self._protocol, len(judge.views), recipes) if self._page else None
         judge = replace(judge, watcher=gallery)
         self._rows += evaluation.all_rows(wrapped, judge, self._scales, recipes, **settings)
-        self._notes |= dict.fromkeys([*judge.notes, *evaluation.notes(wrapped, self._scales, appearance)])
+        notes = [*judge.notes, *evaluation.notes(wrapped, self._scales, appearance)]
+        self._notes |= dict.fromkeys(notes + evaluation.other_filters(judge.protocol, self._scales, recipes, settings))
         self.judged.append(len(judge.views))
         self._galleries.append(gallery)
 
@@ -157,7 +161,7 @@ def _scene(folder: Path, appearance: str) -> Scene:
 def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], cameras: Sequence[Path], outputs: Sequence[Path], overwrite: bool) -> None:
     for option, given in {"--images": images, "--cameras": cameras or checkpoint}.items():
         if len(checkpoint) != len(given):
-            how = f"one for each checkpoint, all behind one {option} (a second {option} replaces the first)"
+            how = f"one for each checkpoint, all behind one {option}"
             raise SettingsError(f"{option}: give {how}; got {len(given)}, for {len(checkpoint)} of these")
     if len(set(outputs)) < len(outputs):
         raise SettingsError(f"{outputs[0]}: the page is written there; give the rows another name, such as {outputs[0].with_suffix('.json')}")

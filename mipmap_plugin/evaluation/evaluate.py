@@ -150,6 +150,19 @@ def notes(model: Wrapped, scales: Sequence[float], appearance: str = "mean") -> 
     return messages + not_exposed(model.model) + _appearance_note(model.model, appearance)
 
 
+def other_filters(protocol: Protocol, scales: Sequence[float], recipes: Sequence[str], settings: dict[str, Any]) -> list[str]:
+    """Which recipes are adapted to images that another filter made smaller than the truth's, in a sentence. `settings`: as of `all_rows`."""
+    truth, used = protocol.shrink_by, dict[str, str]()
+    same = {"box": "area"}.get(truth, truth)  # means of whole blocks, and of any
+    for name, scale in product(recipes, scales):
+        config = _config(name, scale, settings)
+        if scale < 1 and most_steps(name, scale, config.steps) and config.resize not in (truth, same):
+            used[name] = config.resize
+    others = ", ".join(f"{name} ({own})" for name, own in used.items())
+    aimed = f"--resize {same} adapts to images that are made as the truth is"
+    return [f"{protocol.name} makes photographs smaller by another filter ({truth}) than base images are for {others}; {aimed}"] if others else []
+
+
 def _appearance_note(model: SplatModel, appearance: str) -> list[str]:
     """The appearance of test views in a sentence, if the model has appearances; `appearance`: "mean" or "upstream"."""
     if not any(effect.name == "appearance embedding" and effect.on for effect in effects_of(model)):
@@ -208,14 +221,19 @@ def all_rows(model: Wrapped, judge: Evaluator, scales: Sequence[float], recipes:
     viewer, rows = settings.get("viewer"), []
     model.targets(viewer)  # raise errors of the viewer, the recipes and the settings before any work
     for name, scale in product(recipes, scales):
-        make_config(name, scale, **{key: value for key, value in settings.items() if key in AdaptConfig.model_fields})
-    model.refuse_undrawn([view.camera for view in judge.views])
+        _config(name, scale, settings)
+    model.refuse_undrawn([view.camera for view in judge.views], max(scales))
     if doubt := of_another_scene(model, judge.views, scales[0], judge.protocol):
         warnings.warn(doubt, stacklevel=2)
     for scale in scales:
         rows += training_free_rows(model, judge, scale, settings.get("upsampler", "bicubic"), viewer=viewer)
         rows += _adapted_rows(model, judge, scale, recipes, settings) if scale != 1 or viewer else []
     return rows
+
+
+def _config(name: str, scale: float, settings: dict[str, Any]) -> AdaptConfig:
+    """The settings of a recipe with those of `Wrapped.adapt` that belong to it. Raises SettingsError."""
+    return make_config(name, scale, **{key: value for key, value in settings.items() if key in AdaptConfig.model_fields})
 
 
 def _adapted_rows(model: Wrapped, judge: Evaluator, scale: float, recipes: Sequence[str], settings: dict[str, Any]) -> list[Row]:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import NEAR_PLANE, Effect, Effects
-from mipmap_plugin.errors import PluginError, ShapeError
+from mipmap_plugin.errors import PluginError, ShapeError, type_of
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
 from mipmap_plugin.models.hosts import Capture
@@ -212,7 +212,7 @@ def checked_splats(model: SplatModel, camera: Camera) -> Gaussians:
     except ShapeError as error:  # of the record that it makes
         raise PluginError(f"family {model.family!r}: gaussians() returned splats that do not fit together: {error}") from error
     if not isinstance(gaussians, Gaussians):
-        raise PluginError(f"family {model.family!r}: gaussians() has to return Gaussians; it returned a {type(gaussians).__name__}")
+        raise PluginError(f"family {model.family!r}: gaussians() has to return Gaussians; it returned {type_of(gaussians)}")
     tensors = {name: tensor for name, tensor in vars(gaussians).items() if isinstance(tensor, Tensor)}
     if wrong := [name for name, tensor in tensors.items() if not tensor.isfinite().all()]:
         raise PluginError(f"family {model.family!r}: gaussians() returned NaN or infinity in {', '.join(wrong)}; leave such splats out while loading")

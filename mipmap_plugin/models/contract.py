@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import CheckpointError, PluginError
+from mipmap_plugin.errors import CheckpointError, PluginError, type_of
 from mipmap_plugin.formats.atomic import staged
 from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.gaussians import Gaussians
@@ -98,7 +98,7 @@ def refuse_broken(model: SplatModel, camera: Camera, *, steps: bool) -> None:
     with naming(family):
         copied = model.copy()
         if missing := lacking(copied):
-            raise PluginError(f"{family}: copy() returned a {type(copied).__name__}, which lacks {', '.join(missing)}")
+            raise PluginError(f"{family}: copy() returned {type_of(copied)}, which lacks {', '.join(missing)}")
         own, theirs = ({**each.parameters(), **each.shared_parameters()} for each in (model, copied))
     places = {tensor.untyped_storage().data_ptr() for tensor in own.values() if tensor.numel()}
     if shared := [name for name, tensor in theirs.items() if tensor.untyped_storage().data_ptr() in places]:
@@ -128,7 +128,7 @@ def row_opacities(model: SplatModel, views: Sequence[Camera]) -> Tensor:
     opacities: Any = model.row_opacities(views)
     rows = len(model.parameters()["means"])
     if not isinstance(opacities, Tensor) or tuple(opacities.shape) != (rows,) or not opacities.isfinite().all():
-        got = f"a tensor {list(opacities.shape)}" if isinstance(opacities, Tensor) else f"a {type(opacities).__name__}"
+        got = f"a tensor {list(opacities.shape)}" if isinstance(opacities, Tensor) else type_of(opacities)
         got += ", not all finite" if isinstance(opacities, Tensor) and not opacities.isfinite().all() else ""
         wanted = f"{rows} finite numbers, one for each row of its parameters"
         raise PluginError(f"family {model.family!r}: row_opacities() has to return {wanted}; it returned {got}")
@@ -169,7 +169,7 @@ def save(model: SplatModel, path: Path, provenance: dict[str, Any], *, overwrite
     or that no family knows."""
     saved: Any = model.save(path, provenance=provenance, overwrite=overwrite)
     if not isinstance(saved, (str, Path)):
-        wrong = f"save() has to return the path of the file that it wrote; it returned a {type(saved).__name__}"
+        wrong = f"save() has to return the path of the file that it wrote; it returned {type_of(saved)}"
         raise PluginError(f"family {model.family!r}: {wrong}, so that {path} is left without a report")
     if is_third_party(model):
         _refuse_unlike(f"family {model.family!r}", Path(saved))

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mipmap_plugin.errors import CheckpointError, PluginError
+from mipmap_plugin.errors import CheckpointError, PluginError, type_of
 from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
@@ -88,7 +88,7 @@ def _claims(files: Files) -> tuple[dict[str, tuple[Family, Match]], list[str]]:
             family = find_family(name)
             match = family.recognize(files)
             if not isinstance(match, Match | None):
-                raise PluginError(f"its recognize returns a {type(match).__name__}; it has to be a Match or None")
+                raise PluginError(f"its recognize returns {type_of(match)}; it has to be a Match or None")
             if match is not None:
                 claims[name] = family, match
         except (Exception, SystemExit) as error:  # third-party code may fail in any way

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from mipmap_plugin.errors import PluginError
+from mipmap_plugin.errors import PluginError, with_article
 from mipmap_plugin.formats.splat_transform import EXCHANGE
 from mipmap_plugin.formats.tags import render_mode
 from mipmap_plugin.formats.zipped import only_ply
@@ -260,5 +260,5 @@ def find_family(name: str) -> Family:
 def not_loaded(name: str) -> str:
     """The message for a family that is recognized but not loaded."""
     record = find_family(name)
-    message = f"this is a {record.title} checkpoint, a family that is recognized but not loaded by this version of mipmap_plugin"
+    message = f"this is {with_article(record.title)} checkpoint, a family that is recognized but not loaded by this version of mipmap_plugin"
     return message + record.not_loaded

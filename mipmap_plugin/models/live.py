@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mipmap_plugin.errors import SettingsError, ShapeError
+from mipmap_plugin.errors import SettingsError, ShapeError, type_of
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import splatfacto
 from mipmap_plugin.models.anchors.companions import NEEDED
@@ -105,7 +105,7 @@ def adopt(model: Any) -> SplatModel:
     if set(gsplat.NAMES) == set(tensors):
         return _adopted(model, _copied(model, tensors), TrainedScale(near_plane=gsplat.NEAR_PLANE, up=gsplat.UP), Origin(host=gsplat.GsplatHost()))
     content = f" with {', '.join(map(str, list(tensors)[:8]))}" if tensors else ""
-    raise SettingsError(f"a {_name(model)}{content} is not a known kind of model; {_advice(model, tensors)}")
+    raise SettingsError(f"{type_of(model)}{content} is not a known kind of model; {_advice(model, tensors)}")
 
 
 def _of_nerfstudio(model: Any) -> Any:

@@ -74,6 +74,8 @@ def _of_file(path: Path, cfg: dict[str, Any] | None) -> Scene:
         return Scene(tuple(cameras), {}, path, [])
     if path.suffix.lower() != ".json":
         there = f"; give its folder, {path.parent}" if path.name in COLMAP_FILES else "; export them as one of these"
+        if path.suffix.lower() == ".ply":
+            there = "; this PLY has no camera in it: give the cameras of its scene"
         raise SceneError(f"{path}: is no file of cameras that is read here (cameras.json, a transforms.json, or the folder of a COLMAP model){there}")
     data = read_json(path)
     if path.name.startswith("transforms") or (isinstance(data, dict) and "frames" in data):

@@ -41,6 +41,9 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     model = _read(path)
     folder = _photographs(path, photographs_folder(cfg))
     try:
+        whole = _whole_names(path)
+        for number, image in model.images.items():
+            image.name = whole.get(number, image.name)
         images = sorted(model.images.values(), key=lambda image: image.name)
     except UnicodeDecodeError as error:
         raise SceneError(f"{path}: the COLMAP model has names of images that are no UTF-8; copy or export it again") from error
@@ -99,6 +102,18 @@ def _read(path: Path) -> pycolmap.Reconstruction:
         return pycolmap.Reconstruction(folder)
     except Exception as error:  # pycolmap passes on any C++ exception for a damaged file
         raise SceneError(f"{folder}: is not a COLMAP model that pycolmap reads ({brief(error)}); copy or export it again") from error
+
+
+def _whole_names(path: Path) -> dict[int, str]:
+    """The names of a text model's images, by their numbers: COLMAP writes them whole, and pycolmap reads them up to the first blank."""
+    folder = _model_folder(path) or path
+    if (folder / "images.bin").is_file():  # which has no such text, and is read where there are both
+        return {}
+    with (folder / "images.txt").open(encoding="utf-8") as lines:
+        rows = (line.strip() for line in lines)
+        found = [(row, next(rows, "")) for row in rows if row and not row.startswith("#")]  # an image, and its points on the next line
+    fields = [row.split(maxsplit=9) for row, _ in found]
+    return {int(row[0]): row[9] for row in fields if len(row) > 9}
 
 
 def _lens(camera: pycolmap.Camera) -> Lens | None:

@@ -103,6 +103,12 @@ def test_names_of_another_type_are_refused(wrong, sentence):
         wrapped(tiny.gaussians(2)).render(tiny.cameras(1)[0], **wrong)
 
 
+def test_a_mistyped_screen_filter_is_told_which_there_are():
+    there_are = "there is no screen filter 'antialised'; choose from scaled, classic, antialiased, mip, analytic, window; did you mean antialiased"
+    with pytest.raises(SettingsError, match=there_are):
+        wrapped(tiny.gaussians(2)).render(tiny.cameras(1)[0], screen_filter="antialised")
+
+
 def test_the_line_of_an_effect_names_its_cost():
     on = explain(Effects(2, supersampling=3), with_bands(2, 3))
     off = explain(Effects(0), with_bands(0, 3))

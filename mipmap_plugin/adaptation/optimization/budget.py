@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,12 +17,18 @@ from mipmap_plugin.adaptation.following import Following
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.optimization.run import Run, Task
+from mipmap_plugin.adaptation.optimization.validation import WINDOW
+from mipmap_plugin.adaptation.target.pseudo_truth import resolution
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.models.base import SplatModel
 
 # A step takes so many times as long as its images, drawn one by one: they are drawn together, and then differentiated and moved.
 STEP_OVER_IMAGE = 2.2
+
+# A truth takes so many times as long as its pixels in an image of the new scale: large ones wait for memory, and are made smaller. Chair at
+# 4000 px takes 2 to 4 s, of which its pixels would take 0.8.
+TRUTH_OVER_IMAGE = 2.5
 
 # A short run uses each view so many times: a truth costs about as much as a view's part of a few steps. With 7, chair loses 0.7 dB in six seconds.
 USES = 4
@@ -31,8 +37,8 @@ USES = 4
 # ends well, but one of too few leaves time unused.
 SPARE = 1.25
 
-# Measured so many times, of which the shortest counts.
-REPEATS = 2
+# Measured so many times, of which the shortest counts, unless the first takes longer than this.
+REPEATS, LONG_S = 2, 0.5
 
 # Different states of the splats of which the best is chosen after the steps: the start, the best and the last one.
 STATES = 3
@@ -49,16 +55,28 @@ class Pace:
 
     @classmethod
     @torch.no_grad()
-    def of(cls, student: SplatModel, task: Task) -> Pace:
-        """The pace of a run over `student`. The truths that are made for it are used later."""
+    def of(cls, student: SplatModel, task: Task, size: float = 1.0, left: float = math.inf) -> Pace:
+        """The pace of a run over `student` that has so many seconds left. The truths that are made for it are used later.
+
+        `size`: the fraction of the base's size at which these are drawn. No image and no truth is made if more time than is left is expected of
+        it, by its pixels: of a large image its middle is measured.
+        """
         views, validation = task.views[:REPEATS], task.validation
         cameras = [view.zoomed(task.scale) for view in views]
         device = student.parameters()["means"].device
-        image = min(_seconds(lambda camera: task.render(student.gaussians(camera), camera), camera, device) for camera in cameras)
-        truths = [_seconds(task.truth, view, device) for view in views]
+
+        def shortest(cameras: Sequence[Camera]) -> float:
+            return _shortest(lambda camera: task.render(student.gaussians(camera), camera), cameras, device)
+
+        image, middle = 0.0, cameras[0].window(WINDOW, WINDOW)
+        if middle.size != cameras[0].size:
+            image = shortest([middle]) * math.prod(cameras[0].size) / math.prod(middle.size)
+        image = image if image > left else shortest(cameras)
+        truth = TRUTH_OVER_IMAGE * image * (size / task.scale) ** 2
+        truth = truth if truth > left else _shortest(task.truth, views, device)
         moments = {view.time for view in validation.choosing} if task.follow.moments else ()
         choice = STATES * (len(validation.choosing) * image + len(moments) * task.follow.evaluation)
-        return cls(STEP_OVER_IMAGE * image, min(truths), image * len(validation.steering), choice)
+        return cls(STEP_OVER_IMAGE * image, truth, image * len(validation.steering), choice)
 
     def a_step(self, config: AdaptConfig) -> float:
         """With its part of the truths and the checks."""
@@ -89,8 +107,10 @@ def within_budget(run: Run, task: Task, config: AdaptConfig) -> tuple[Task, Adap
         return task, config
     if not run.planned:
         with run.watch:
-            pace = Pace.of(run.student, task)
+            pace = Pace.of(run.student, task, resolution(config, task.scale), config.time_budget_s - run.watch.seconds)
         run.reserved, run.planned = pace.a_choice, config.steps
+        if run.seconds + pace.a_view + pace.a_truth > config.time_budget_s:  # not even a step of one view
+            run.reserved += pace.a_view + pace.a_truth
         if config.gathering:
             run.planned = min(most_of(config), pace.steps(config, max(0.0, config.time_budget_s - run.seconds), task.follow))
     if not config.gathering:
@@ -114,6 +134,12 @@ def no_steps_notes(run: Run, config: AdaptConfig, share: float = 1.0) -> list[st
         return []
     least = math.ceil(2 * run.seconds / share)  # the start takes half of a share at most
     return [f"the time budget of {config.time_budget_s / share:g} s left no time for steps after the start; give {least} s or more to have some"]
+
+
+def _shortest(function: Callable[[Camera], object], cameras: Sequence[Camera], device: torch.device) -> float:
+    """The least of the seconds that each camera takes; of long ones those of the first."""
+    first = _seconds(function, cameras[0], device)
+    return first if first > LONG_S else min([first, *(_seconds(function, camera, device) for camera in cameras[1:])])
 
 
 def _seconds(function: Callable[[Camera], object], camera: Camera, device: torch.device) -> float:

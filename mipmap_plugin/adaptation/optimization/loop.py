@@ -54,6 +54,9 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
         while reason is None and run.step < config.steps:
             with run.watch:
                 views = order(run.step, run.progress(config))
+                if run.step and _budget_left(run, config) < _truths_take(run, views):
+                    reason = End.TIME
+                    break
                 _make_truths(run, task, config, order, views)
                 with run.threads.step(len(views), run.costs):
                     _step(run, task, config, views, cameras)
@@ -76,6 +79,12 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
 
 def _budget_left(run: Run, config: AdaptConfig) -> float:
     return math.inf if config.time_budget_s is None else max(0.0, config.time_budget_s - run.seconds)
+
+
+def _truths_take(run: Run, views: Sequence[Camera]) -> float:
+    """The seconds that the truths of those views which have none yet are expected to take: of large ones, more than a budget has left."""
+    known = run.costs.truths
+    return sum(view not in known for view in views) * max(known.values(), default=0.0)
 
 
 def is_checked(step: int, config: AdaptConfig) -> bool:

@@ -34,13 +34,18 @@ def blend_weights(gaussians: Gaussians, views: Sequence[Camera], backend: Backen
     return total / len(views)
 
 
-def weighed(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects) -> tuple[Tensor, float]:
-    """`blend_weights`, and the fraction of the splats that a view shows, mean over `views`; what is hidden behind others does not count."""
+def weighed(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects, size: float = 1.0) -> tuple[Tensor, float]:
+    """`blend_weights`, and the fraction of the splats that a view shows, mean over `views`; what is hidden behind others does not count.
+
+    `size`: a fraction of the views' own, at which they are drawn; the dilation keeps its size in the world.
+    """
     total, shown = (torch.zeros_like(gaussians.opacities) for _ in range(2))
+    views = views if size == 1 else [view.zoomed(size) for view in views]
+    effects = replace(effects, eps2d=effects.eps2d * size**2, settings=effects.settings.finer(size))
     for some in _of_views(gaussians, views, backend, effects):
         total += some.sum(0)
-        shown += (some > SHOWN).sum(0)
-    return total / len(views), float(shown.mean()) / len(views)
+        shown += (some > SHOWN * size**2).sum(0)
+    return total / (len(views) * size**2), float(shown.mean()) / len(views)
 
 
 def _of_views(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects) -> Iterator[Tensor]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import NamedTuple, cast
 
@@ -13,6 +11,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights, may_show, weighed, whole_weights
+from mipmap_plugin.adaptation.start.clock import Clock
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import ROUNDS, matched_opacities
 from mipmap_plugin.adaptation.start.merging import Rounds, merge_down, merge_seen
@@ -24,7 +23,6 @@ from mipmap_plugin.effects import SURFEL
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, Thinned
 from mipmap_plugin.models.contract import rebuild, reshape
-from mipmap_plugin.process.clock import now
 from mipmap_plugin.render_settings import MIN_ALPHA
 from mipmap_plugin.screen_filters import INTEGRATED
 
@@ -83,9 +81,10 @@ class StartSearch:
         self._of_base: tuple[Tensor, Tensor] | None = None  # the base's means and its pixel size
         self._shown = torch.empty(0, dtype=torch.bool)  # of the base's splats (`may_show`), once blend weights are known
         self._least = 0.0  # fraction of the rows that stay
+        self._size = 1.0  # fraction of their size at which views are weighed: less where a time budget leaves no time for large ones
         self.notes: list[str] = []  # on what the views show of the base
         budget, device = problem.config.time_budget_s, problem.base().parameters()["means"].device
-        self._clock = _Clock(START_SHARE * budget if budget else math.inf, device)
+        self._clock = Clock(START_SHARE * budget if budget else math.inf, device)
         self._alike = draws_alike(problem.base_effects, problem.target)
         # The steps of a zoom-out end 0.2 dB higher from the base's own shapes (lego and chair, x1/4).
         keeps = self._alike and problem.config.steps > 0 and problem.scale <= 1
@@ -222,7 +221,7 @@ class StartSearch:
         scales, opacities = closed_form(gaussians, problem.views, problem.scale, problem.base_effects, problem.target, settings)
         if weights is None or not rounds:
             return scales, opacities
-        size = min(1.0, problem.scale)  # a zoom-in is weighed in images of the base's size: sums over pixels need no finer ones
+        size = min(self._size, problem.scale)  # a zoom-in is weighed in images of the base's size: sums over pixels need no finer ones
         finer = problem.scale / size
         target = replace(problem.target, eps2d=problem.target.eps2d / finer**2, settings=problem.target.settings.finer(1 / finer))
         views = [view.zoomed(size) for view in evenly(problem.views, self._count)]
@@ -248,15 +247,18 @@ class StartSearch:
         """[N]: the blend weights of the base's splats, in target pixels of a view, from as many views as show enough of them."""
         problem, gaussians = self._problem, base.gaussians(self._problem.views[0]).detach()
 
-        def over(count: int) -> tuple[Tensor, float]:
-            return weighed(gaussians, evenly(problem.views, count), problem.backend, problem.base_effects)
+        def over(count: int, size: float) -> tuple[Tensor, float]:
+            return weighed(gaussians, evenly(problem.views, count), problem.backend, problem.base_effects, size)
 
+        self._size = self._clock.size(problem.views[0], LEAST_VIEWS, lambda size: over(1, size))
         with self._clock.timing("weights"):
-            weights, shown = over(LEAST_VIEWS)
+            weights, shown = over(LEAST_VIEWS, self._size)
         self._count = views_for(shown)
+        while self._count > LEAST_VIEWS and not self._clock.allows("weights", self._count / LEAST_VIEWS):
+            self._count //= 2
         if self._count > LEAST_VIEWS:
             with self._clock.timing("weights"):
-                weights, _ = over(self._count)
+                weights, _ = over(self._count, self._size)
         weights = weights * problem.scale**2
         whole, looked_at = self._whole_weights(gaussians, self._pixel_size(gaussians.means)), evenly(problem.views, self._count)
         self._shown = may_show(weights, whole, gaussians.means, problem.views, looked_at)
@@ -265,21 +267,3 @@ class StartSearch:
             advice = "give cameras that show all of the scene, or look at it from where these do"
             self.notes.append(f"no view shows {hidden:.0%} of the splats, of which the dB say nothing: {advice}")
         return weights
-
-
-class _Clock:
-    """What the rest of a start's time allows, that of a GPU included."""
-
-    def __init__(self, seconds: float, device: torch.device) -> None:
-        self._device, self._took = device, dict[str, float]()
-        self._end = now(device) + seconds
-
-    @contextmanager
-    def timing(self, work: str, amount: float = 1.0) -> Iterator[None]:
-        began = now(self._device)
-        yield
-        self._took[work] = (now(self._device) - began) / amount
-
-    def allows(self, work: str, amount: float = 1.0) -> bool:
-        """Whether there is time for an amount of a work, each unit of which takes as long as the last time."""
-        return now(self._device) + amount * self._took.get(work, 0.0) <= self._end

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.super_resolution import SUFFIXES, Network
-from mipmap_plugin.errors import PluginError, SettingsError
+from mipmap_plugin.errors import PluginError, SettingsError, type_of
 from mipmap_plugin.plugin_errors import is_third_party, naming
 from mipmap_plugin.registry import Registry
 
@@ -60,7 +60,7 @@ def _enlarged(name: str, upsampler: Upsampler, image: Tensor, size: tuple[int, i
 
 def _described(made: Any) -> str:
     if not isinstance(made, Tensor):
-        return f"a {type(made).__name__}"
+        return type_of(made)
     return f"{list(made.shape)} in {made.dtype}{'' if made.isfinite().all() else ', not all finite'}"
 
 

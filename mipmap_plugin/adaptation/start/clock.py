@@ -1,0 +1,45 @@
+"""What the rest of a start's time allows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import torch
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.process.clock import now
+
+# px: smaller views are not weighed, along the geometric mean of their sides: one then takes a twentieth of a second. And the fraction of the time
+# left that weighing the first views may take: the same is done again for the closed form.
+LEAST_SIDE, WEIGHING = 1000, 1 / 3
+
+
+class Clock:
+    """The time that is left for a start, that of a GPU included; each unit of a work takes as long as the last time."""
+
+    def __init__(self, seconds: float, device: torch.device) -> None:
+        self._device, self._took = device, dict[str, float]()
+        self._end = now(device) + seconds
+
+    @contextmanager
+    def timing(self, work: str, amount: float = 1.0) -> Iterator[None]:
+        """Note what an amount of a work takes."""
+        began = now(self._device)
+        yield
+        self._took[work] = (now(self._device) - began) / amount
+
+    def allows(self, work: str, amount: float = 1.0) -> bool:
+        """Whether there is time for an amount of a work."""
+        return now(self._device) + amount * self._took.get(work, 0.0) <= self._end
+
+    def size(self, view: Camera, count: int, weigh: Callable[[float], object]) -> float:
+        """The fraction of its size at which so many views like `view` can be weighed; `weigh(fraction)` does it with one."""
+        least = LEAST_SIDE / math.sqrt(view.width * view.height)
+        if least >= 1 or math.isinf(self._end):
+            return 1.0
+        with self.timing("trial"):
+            weigh(least)
+        possible = WEIGHING * (self._end - now(self._device)) / (count * self._took["trial"])  # views of the least size, in place of each
+        return min(1.0, least * math.sqrt(max(1.0, possible)))
