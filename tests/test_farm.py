@@ -130,6 +130,24 @@ def test_files_that_are_sent_come_back_adapted(tmp_path):
     assert [outcome.status for outcome in on_dask(jobs[:1], "local:1", threads=1, send_files=True)] == ["finished before"]
 
 
+def test_a_task_is_stopped_where_many_files_are_open(tmp_path, monkeypatch):
+    """More than `select` takes: 1024."""
+    from mipmap_plugin.jobs import farm as module
+
+    said = iter([False, False])
+    monkeypatch.setattr(module, "Event", lambda name: SimpleNamespace(is_set=lambda: next(said, True)))
+    monkeypatch.setattr(module, "PERIOD_S", 0.01)
+    settings = {"steps": 100_000, "views": "given", "patience": None}
+    job = Job(Base(tiny.folder(tmp_path / "base", tiny.cameras(3)), backend="reference"), tmp_path / "a.ply", 0.5, settings=settings)
+    files = [open(os.devnull) for _ in range(1100)]  # noqa: SIM115
+    try:
+        assert module._task(job, 1, "stop").status == "interrupted"
+    finally:
+        module._mine.worker.close()
+        for file in files:
+            file.close()
+
+
 def test_a_checkpoint_that_cannot_be_sent_fails_alone(tmp_path):
     from mipmap_plugin.jobs import farm
 

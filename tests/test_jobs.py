@@ -6,6 +6,7 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -514,16 +515,22 @@ def worker():
     worker.close()
 
 
-def test_a_job_whose_worker_is_killed_is_done_again(worker, tmp_path):
-    killed = []
+def test_a_job_whose_worker_is_killed_is_done_again(worker, tmp_path, monkeypatch):
+    begin, killed = worker.begin, []
 
-    def kill_once():
-        if not killed:
-            killed.append(os.kill(worker._process.pid, signal.SIGKILL))
+    def kill(most):
+        def begin_and_kill(job):
+            begin(job)
+            if len(killed) < most:
+                killed.append(os.kill(worker._process.pid, signal.SIGKILL))
 
-    outcome = do(job_of(tmp_path), worker, kill_once)
+        monkeypatch.setattr(worker, "begin", begin_and_kill)
+
+    kill(1)
+    outcome = do(job_of(tmp_path), worker)
     assert killed and outcome.status == "done" and (tmp_path / "out.ply").exists()
-    failed = do(job_of(tmp_path, target=tmp_path / "other.ply"), worker, lambda: os.kill(worker._process.pid, signal.SIGKILL))
+    kill(9)
+    failed = do(job_of(tmp_path, target=tmp_path / "other.ply"), worker)
     assert failed.status == "failed" and "was killed, perhaps for want of memory" in failed.reason
     worker.stop()
     assert do(job_of(tmp_path), worker).status == "interrupted"
@@ -537,15 +544,18 @@ def test_nothing_is_lost_whenever_a_worker_is_killed(tmp_path):
     assert do(replace(job, target=tmp_path / "whole.ply"), Worker(1)).status == "done"
     seconds, killed = time.monotonic() - began, 0
     for number in range(20):
-        again, worker, at = replace(job, target=tmp_path / f"{number}.ply"), Worker(1), [moments.uniform(0, seconds)]
+        again, worker = replace(job, target=tmp_path / f"{number}.ply"), Worker(1)
 
-        def kill_once(worker=worker, at=at):
+        def kill_once(worker=worker):
             nonlocal killed
-            if at and not worker.has_ended(at.pop()):
+            if worker._process is not None:
                 killed += 1
                 os.kill(worker._process.pid, signal.SIGKILL)
 
-        assert do(again, worker, kill_once).status in ("done", "finished before")  # before, if it was killed on its way to say so
+        timer = threading.Timer(moments.uniform(0, seconds), kill_once)
+        timer.start()
+        assert do(again, worker).status in ("done", "finished before")  # before, if it was killed on its way to say so
+        timer.cancel()
         worker.close()
         assert again.target.read_bytes() == (tmp_path / "whole.ply").read_bytes()
     assert killed >= 10 and not list(tmp_path.glob("*.resume*")) and not list(tmp_path.glob(".*"))

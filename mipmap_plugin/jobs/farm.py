@@ -111,16 +111,25 @@ def _task(sent: Job | Parcel, threads: int | None, stop_name: str) -> Outcome | 
     worker: Worker | None = getattr(_mine, "worker", None)
     if worker is None or worker.stopped or worker.threads != threads:
         worker = _mine.worker = Worker(threads)
-
-    def watch() -> None:
-        while not worker.has_ended(PERIOD_S):
-            if stop.is_set():
-                worker.stop()
-                return
-
     if stop.is_set():
         return Outcome(sent.job if isinstance(sent, Parcel) else sent, "interrupted", reason="interrupted")
-    return do_parcel(sent, lambda job: do(job, worker, watch)) if isinstance(sent, Parcel) else do(sent, worker, watch)
+    with _stopped_by(stop, worker):
+        return do_parcel(sent, lambda job: do(job, worker)) if isinstance(sent, Parcel) else do(sent, worker)
+
+
+@contextmanager
+def _stopped_by(stop: Event, worker: Worker) -> Iterator[None]:
+    """Inside, the worker is stopped once `stop` is set."""
+    ended = threading.Event()
+
+    def watch() -> None:
+        while not ended.wait(PERIOD_S):
+            with suppress(OSError):  # a scheduler that cannot be reached now
+                if stop.is_set():
+                    return worker.stop()
+
+    with _beside(watch, ended):
+        yield
 
 
 def _outcome(future: Future[Outcome | Delivery], job: Job) -> Outcome:
@@ -173,6 +182,13 @@ def _kept_workers(client: Client, place: str) -> Iterator[None]:
                 if looks == 2:
                     note(f"--dask {place}: there are no workers, so nothing is done until one comes; Ctrl-C ends this, and the same command goes on")
 
+    with _beside(watch, ended):
+        yield
+
+
+@contextmanager
+def _beside(watch: Callable[[], None], ended: threading.Event) -> Iterator[None]:
+    """Inside, `watch` runs in a thread of its own, until `ended` is set."""
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
     try:

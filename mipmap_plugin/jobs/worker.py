@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import os
 import pickle
-import select
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from typing import IO, cast
@@ -49,10 +47,6 @@ class Worker:
         except BrokenPipeError:
             raise self._death() from None
 
-    def has_ended(self, seconds: float) -> bool:
-        """Wait for the end of the job, at most so many seconds; return whether it has ended."""
-        return bool(self._process is None or select.select([cast(IO[bytes], self._process.stdout)], [], [], seconds)[0])
-
     def outcome(self) -> Outcome:
         """Wait for the outcome of the job. Raises WorkerDied."""
         try:
@@ -89,16 +83,12 @@ class Worker:
         return WorkerDied(f"the process that did it ended with {f'signal {-code}' if code < 0 else f'exit code {code}'}")
 
 
-def do(job: Job, worker: Worker, watch: Callable[[], None] = lambda: None, attempts: int = ATTEMPTS) -> Outcome:
-    """Do a job in a worker; if that dies, in a new one, up to `attempts` times. `watch` is called while the job runs.
-
-    Raises ValueError without attempts.
-    """
+def do(job: Job, worker: Worker, attempts: int = ATTEMPTS) -> Outcome:
+    """Do a job in a worker; if that dies, in a new one, up to `attempts` times. Raises ValueError without attempts."""
     sent = replace(job, base=job.base.unpacked())
     for attempt in range(1, attempts + 1):
         try:
             worker.begin(sent)
-            watch()
             outcome = worker.outcome()
             return replace(outcome, job=job, reason=told(outcome.reason))
         except WorkerDied as death:
