@@ -22,12 +22,12 @@ _KINDS = [np.dtype(kind) for kind in (np.float64, np.float32, np.int64, np.int32
 
 
 def _named(module: str, name: str, function: Callable[..., Any]) -> Any:
-    """`function` with a qualified name of NumPy's; torch takes the names of safe globals from the functions themselves."""
+    """`function` with a name of NumPy's; torch takes the names of safe globals from the functions themselves, before 2.6 the short ones."""
 
     def stand_in(*values: Any) -> Any:
         return function(*values)
 
-    stand_in.__module__, stand_in.__qualname__ = module, name
+    stand_in.__module__, stand_in.__name__, stand_in.__qualname__ = module, name, name
     return stand_in
 
 
