@@ -40,7 +40,7 @@ from mipmap_plugin.process import threads
 from mipmap_plugin.process.torch_modes import usual_modes
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
-from mipmap_plugin.scenes.trajectories import Orbit
+from mipmap_plugin.scenes.orbits import Orbit
 from mipmap_plugin.screen_filters import DILATION, USUAL_EPS2D, check_screen_filter
 from mipmap_plugin.splatting.filters import INTEGRALS
 from mipmap_plugin.splatting.viewers import find_viewer, own_name, viewers_for

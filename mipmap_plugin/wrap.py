@@ -29,7 +29,7 @@ from mipmap_plugin.models.live import adopt
 from mipmap_plugin.process.threads import checked as checked_threads
 from mipmap_plugin.process.torch_modes import usual_modes
 from mipmap_plugin.scenes import Scene, load_scene
-from mipmap_plugin.scenes.trajectories import AXES
+from mipmap_plugin.scenes.orbits import AXES
 from mipmap_plugin.screen_filters import USUAL_EPS2D, check_screen_filter
 
 if TYPE_CHECKING:

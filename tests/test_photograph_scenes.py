@@ -16,7 +16,8 @@ from mipmap_plugin.evaluation.tradeoff.truth import base_itself, unseen
 from mipmap_plugin.levels.yardstick import Yardstick
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes import cameras_in, load_scene
-from mipmap_plugin.scenes.trajectories import SWAY, Orbit, with_company
+from mipmap_plugin.scenes.orbits import Orbit
+from mipmap_plugin.scenes.trajectories import SWAY, with_company
 
 INTRINSIC = (40.0, 0.0, 16.0, 0.0, 40.0, 12.0, 0.0, 0.0, 1.0)
 EXTRINSIC = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]])  # the splats lie around the origin

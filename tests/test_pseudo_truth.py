@@ -19,7 +19,7 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.recipes import recipe
-from mipmap_plugin.scenes.trajectories import Orbit
+from mipmap_plugin.scenes.orbits import Orbit
 
 TRAINED = Effects(sh_degree=1)
 

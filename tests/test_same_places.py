@@ -159,6 +159,18 @@ def test_without_cameras_it_is_told_where_views_look_from(files, recwarn):
     assert "from above the horizon, with z up" in above and "--up" not in above
 
 
+@pytest.mark.parametrize(("floaters", "seems"), [(0, False), (1, True)], ids=["an object by itself", "splats far around it"])
+def test_without_cameras_a_capture_is_told_from_an_object(tmp_path, recwarn, floaters, seems):
+    model = tiny.model(40)
+    with torch.no_grad():
+        model.parameters()["means"].copy_(torch.rand(40, 3, generator=torch.Generator().manual_seed(0)))
+        model.parameters()["means"][: 3 * floaters] *= 50
+    base = model.save(tmp_path / "base.ply", provenance={})
+    wrap_model(base).adapt(SCALE, recipe="instant", extra_views=2)
+    [told] = [str(each.message) for each in recwarn if str(each.message).startswith("no cameras")]
+    assert ("this seems to be" in told, "mipmap-plugin view" in told) == (seems, seems)
+
+
 def test_cameras_leave_what_is_up_to_orbits_that_are_asked_for(tmp_path):
     folder = tiny.folder(tmp_path / "base")
     with pytest.warns(UserWarning, match="^up z: there are cameras, whose views are taken"):

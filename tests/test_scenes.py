@@ -12,9 +12,11 @@ import tiny
 import torch
 from PIL import Image
 
+from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import OutputExists, SceneError, SettingsError, ShapeError
 from mipmap_plugin.formats.images import composite, image_size, read_image, write_image
 from mipmap_plugin.scenes import load_scene, model_cameras, read_cameras, read_transforms
+from mipmap_plugin.scenes.base import sizes_of
 from mipmap_plugin.scenes.cameras_json import count_test_cameras, trained_size
 
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
@@ -511,3 +513,16 @@ def test_a_truncated_image_is_damaged(tmp_path):
     path.write_bytes(path.read_bytes()[:3000])
     with pytest.raises(SceneError, match="the image is damaged"):
         read_image(path, WHITE)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "said"),
+    [
+        ([(272, 480), (272, 480)], "272 x 480 px"),
+        ([(272, 480), (480, 272)], "272 x 480 and 480 x 272 px"),
+        ([(816, 1440), (272, 480), (480, 272)], "272 x 480 to 816 x 1440 px"),
+    ],
+    ids=["one size", "portrait and landscape", "two resolutions too"],
+)
+def test_sizes_of_cameras_are_told(sizes, said):
+    assert sizes_of([Camera(*size, 300.0, 300.0, 100.0, 100.0, torch.eye(4)) for size in sizes]) == said

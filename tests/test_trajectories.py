@@ -10,15 +10,16 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import NEAR_PLANE
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.scenes import jittered, load_scene, orbit
-from mipmap_plugin.scenes.trajectories import BEYOND, guess_up, rotation_matrix, rotation_vector
+from mipmap_plugin.scenes.orbits import TIGHT, Orbit, frame, guess_up
+from mipmap_plugin.scenes.trajectories import BEYOND, rotation_matrix, rotation_vector
 
 
 def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def cloud(*spread: float) -> torch.Tensor:
-    return torch.randn(4000, 3, generator=seeded(), dtype=torch.float64) * torch.tensor(spread) + torch.tensor([5.0, -2.0, 1.0])
+def cloud(*spread: float, count: int = 4000) -> torch.Tensor:
+    return torch.randn(count, 3, generator=seeded(), dtype=torch.float64) * torch.tensor(spread) + torch.tensor([5.0, -2.0, 1.0])
 
 
 def ring(count: int = 12) -> list[Camera]:
@@ -50,8 +51,9 @@ def test_orbit_frames_nine_tenths_of_the_splats():
 def test_orbit_ignores_far_floaters_and_broken_rows():
     means = cloud(1, 1, 1)
     dirty = torch.cat([means, torch.full((40, 3), 1e6, dtype=torch.float64), torch.full((1, 3), math.nan, dtype=torch.float64)])
-    clean, spoilt = (orbit(m, (64, 64), 1, seeded())[0].center for m in (means, dirty))
-    torch.testing.assert_close(spoilt, clean, atol=0.5, rtol=0)
+    clean, spoilt = (Orbit.around(m) for m in (means, dirty))
+    assert math.dist(spoilt.center, clean.center) < 0.5
+    assert clean.distance / TIGHT <= spoilt.distance <= clean.distance
 
 
 def test_orbit_stands_above_the_horizon_with_the_vertical_upright():
@@ -88,6 +90,28 @@ def test_orbit_is_the_same_only_for_the_same_seed():
 def test_orbit_of_one_splat_sees_it():
     point = torch.tensor([[1.0, 2.0, 3.0]], dtype=torch.float64)
     assert all(in_view(camera, point).all() for camera in orbit(point, (8, 8), 4, seeded()))
+
+
+def shown(cameras: list[Camera], points: torch.Tensor) -> list[float]:
+    """The share of `points` that each of `cameras` has in its picture."""
+    return [camera.in_picture(camera.to_camera(points)).double().mean().item() for camera in cameras]
+
+
+def statue(floaters: int = 0) -> torch.Tensor:
+    """A wide pedestal of 4,000 splats, 800 of a thin figure on it, up to four times as high, and `floaters` splats far away."""
+    pedestal, figure, around = torch.rand(4800 + floaters, 3, generator=seeded(), dtype=torch.float64).split([4000, 800, floaters])
+    figure = figure * torch.tensor([0.2, 4.0, 0.2]) + torch.tensor([0.4, -4.0, 0.4])
+    return torch.cat([pedestal, figure, 60 * around - 30])
+
+
+def test_orbit_shows_an_object_by_itself_whole():
+    assert frame(statue())[2]
+    assert min(shown(orbit(statue(), (64, 64), 40, seeded()), statue())) > 0.99
+
+
+def test_orbit_leaves_what_lies_far_away_out():
+    center, radius, whole = frame(statue(floaters=300))
+    assert not whole and radius < 4 and center.abs().max() < 1
 
 
 def test_orbit_without_splats_is_refused():

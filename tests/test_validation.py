@@ -39,7 +39,7 @@ from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.models.base import Traits
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.recipes import recipe
-from mipmap_plugin.scenes.trajectories import Orbit
+from mipmap_plugin.scenes.orbits import Orbit
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
 ORBIT = Orbit.around(tiny.gaussians().means)

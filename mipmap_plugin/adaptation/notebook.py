@@ -11,6 +11,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.formats.images import data_uri
+from mipmap_plugin.scenes.base import sizes_of
 
 if TYPE_CHECKING:
     from mipmap_plugin.models.base import SplatModel, TrainedScale
@@ -23,7 +24,7 @@ Render = Callable[[Camera], Tensor]  # a camera -> [h, w, 3]
 
 def base_facts(model: SplatModel, cameras: Sequence[Camera], trained: TrainedScale) -> dict[str, str]:
     """What a base is, by name."""
-    views = f"{len(cameras)} of {cameras[0].width} x {cameras[0].height} px" if cameras else "none"
+    views = f"{len(cameras)} of {sizes_of(cameras)}" if cameras else "none"
     return {
         "family": model.family,
         "splats": f"{len(model.parameters()['means']):,}",

@@ -13,7 +13,7 @@ from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, enlarges
 from mipmap_plugin.models.base import SPLATS, SplatModel
-from mipmap_plugin.scenes.trajectories import Orbit
+from mipmap_plugin.scenes.orbits import Orbit
 
 # The name of the base among a run's states.
 AS_IT_IS = "the base as it is"

@@ -24,7 +24,8 @@ from mipmap_plugin.models.contract import row_opacities
 from mipmap_plugin.models.health import units
 from mipmap_plugin.render_settings import MIN_ALPHA
 from mipmap_plugin.scenes import unread_cameras
-from mipmap_plugin.scenes.trajectories import FRAMED, GOLDEN, ORBIT_FOV, Orbit, jittered, with_company
+from mipmap_plugin.scenes.orbits import FRAMED, GOLDEN, ORBIT_FOV, Orbit, frame
+from mipmap_plugin.scenes.trajectories import jittered, with_company
 
 # A checkpoint without cameras does not say at what resolution it was trained: this many px across 50 degrees is NeRF-Synthetic's.
 ORBIT_PIXELS = 800
@@ -41,9 +42,11 @@ LEAST_PIXELS, LEAST_SHARE = 16, 0.25
 
 # What is said where there are no cameras: with those of an object all is well, but a capture was never seen from there, and loses 10 dB and more.
 ORBITED = (
-    "no cameras are known: views of a generated orbit are adapted to, {told}, and all dB are of such; that suits an object, and no capture; "
+    "no cameras are known: views of a generated orbit are adapted to, {told}, and all dB are of such; that suits an object, and no capture{seems}; "
     "give the scene's cameras (--cameras)"
 )
+CAPTURE = ", which this seems to be, for many splats lie far outside the orbit's pictures: from where people stand it may look worse than its base"
+VIEWED = ", or adapt for what you look at (mipmap-plugin view)"
 
 # Ratio of focal lengths, px, of which views want files as different as scales at such a ratio: two lenses at 5 times cost a capture 10 of 12 dB.
 UNLIKE = 3.0
@@ -246,11 +249,12 @@ def too_small(views: Sequence[Camera], model: SplatModel, near: float, least: fl
     return f"the scene is {units(width, 2)} units wide, and no view shows it larger than {units(most, 2)} px: {wrong}"
 
 
-def orbited(source: Path | None, orbit: Orbit) -> str:
-    """`ORBITED`, with the cameras.json that lies beside the file of the splats."""
-    file = unread_cameras(source)
+def orbited(source: Path | None, orbit: Orbit, means: Tensor) -> str:
+    """What is said of views of an orbit around `means` [N, 3]: `ORBITED`, with the cameras.json that lies beside the file of the splats."""
+    file, whole = unread_cameras(source), frame(means)[2]
     beside = f", such as {file}, if it is of this scene" if file else ""
-    return f"{ORBITED.format(told=orbit.told())}{beside}{'' if orbit.up else ', or say what is up (--up z, for one)'}"
+    others = ("" if whole else VIEWED) + ("" if orbit.up else ", or say what is up (--up z, for one)")
+    return f"{ORBITED.format(told=orbit.told(), seems='' if whole else CAPTURE)}{beside}{others}"
 
 
 def remarks(views: Sequence[Camera], model: SplatModel, near: float, *, orbit: bool) -> list[str]:

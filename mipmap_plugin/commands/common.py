@@ -71,9 +71,11 @@ def without_none(**options: Any) -> dict[str, Any]:
 
 def summary(cameras: Sequence[Camera], unread: Path | None) -> str:
     """Describe cameras in a sentence. `unread`: the file beside a lone file (`unread_cameras`)."""
+    from mipmap_plugin.scenes.base import sizes_of  # here, for it imports torch
+
     if not cameras:
         return f"none are read; {unread} may be of this scene" if unread else "none beside the checkpoint"
-    return f"{len(cameras)}, {cameras[0].width} x {cameras[0].height} px, {sum(c.split == 'test' for c in cameras)} of them test views"
+    return f"{len(cameras)}, {sizes_of(cameras)}, {sum(c.split == 'test' for c in cameras)} of them test views"
 
 
 def print_facts(facts: Any, as_json: bool) -> None:

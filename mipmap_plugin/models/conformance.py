@@ -18,7 +18,7 @@ from mipmap_plugin.models import contract, detect, load_model
 from mipmap_plugin.models.adapted_name import adapted_name
 from mipmap_plugin.models.base import Filtered, Rebuilt, SplatModel, Thinned, why_no_viewer
 from mipmap_plugin.models.vanilla import VanillaModel
-from mipmap_plugin.scenes.trajectories import orbit
+from mipmap_plugin.scenes.orbits import orbit
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
 # Allowed difference of images, because formats round.

@@ -14,7 +14,8 @@ from mipmap_plugin.scenes.cameras_json import read_cameras, write_cameras
 from mipmap_plugin.scenes.colmap import is_colmap, read_colmap
 from mipmap_plugin.scenes.in_ply import cameras_in
 from mipmap_plugin.scenes.moving import is_dynerf, is_hypernerf, read_dynerf, read_hypernerf
-from mipmap_plugin.scenes.trajectories import jittered, orbit
+from mipmap_plugin.scenes.orbits import orbit
+from mipmap_plugin.scenes.trajectories import jittered
 from mipmap_plugin.scenes.transforms import read_transforms
 
 # The names of the files of a COLMAP model.

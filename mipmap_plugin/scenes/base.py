@@ -112,6 +112,13 @@ class Scene:
         return image if lens is None else lens.undistorted(image)
 
 
+def sizes_of(cameras: Sequence[Camera]) -> str:
+    """The sizes of some cameras' pictures in words: "272 x 480 px", or the smallest and the largest where they differ."""
+    sizes = sorted({(camera.width * camera.height, camera.width, camera.height) for camera in cameras})
+    ends = [f"{width} x {height}" for _, width, height in (sizes[0], sizes[-1])]
+    return f"{ends[0]} px" if len(sizes) == 1 else f"{' and ' if len(sizes) == 2 else ' to '}".join(ends) + " px"
+
+
 def refuse_other_shape(stated: tuple[int, int], photograph: tuple[int, int], where: str) -> None:
     """Raise SceneError, beginning with `where`, for a photograph that is no copy of the size that its camera states: one that was turned or cropped.
 

@@ -30,7 +30,7 @@ from mipmap_plugin.models.inria_folder import read_options, trained_scale
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.scenes.trajectories import Orbit
+from mipmap_plugin.scenes.orbits import Orbit
 from mipmap_plugin.tiles.cut import Tree
 from mipmap_plugin.tiles.folder import BASE, CUT
 from mipmap_plugin.tiles.reading import find_splats
@@ -109,7 +109,7 @@ class TiledScene:
         """The views of the whole scene, the same as without tiles."""
         cameras, orbit = seeing(self.wrapped.cameras, self.base.places[:, :3], self.target.near_plane), self.orbit
         if not cameras and self.config.views != "orbit":
-            warnings.warn(orbited(self.checkpoint.path, orbit), stacklevel=1)
+            warnings.warn(orbited(self.checkpoint.path, orbit, self.base.places[:, :3]), stacklevel=1)
         chosen, note = choose_views(cameras, orbit, self.config)
         adapted, validation = split_validation(cameras, chosen, orbit, self.scale, self.config)
         note += f", {len(chosen) - len(adapted)} of them kept for validation" if len(adapted) < len(chosen) else ""

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera, evenly
-from mipmap_plugin.scenes.trajectories import GOLDEN, rotation_matrix
+from mipmap_plugin.scenes.orbits import GOLDEN
+from mipmap_plugin.scenes.trajectories import rotation_matrix
 from mipmap_plugin.viewing.screen import inside
 from mipmap_plugin.wrap import Wrapped
 

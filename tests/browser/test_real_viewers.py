@@ -15,7 +15,7 @@ from browser import VIEWERS, Browser, BrowserError, missing
 from mipmap_plugin import Camera, wrap_model
 from mipmap_plugin.demo.run import embedded
 from mipmap_plugin.formats.ply import read_ply, write_ply
-from mipmap_plugin.scenes.trajectories import Orbit
+from mipmap_plugin.scenes.orbits import Orbit
 from mipmap_plugin.wrap import Wrapped
 
 pytestmark = pytest.mark.browser

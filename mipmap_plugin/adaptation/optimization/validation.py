@@ -27,7 +27,8 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.process.threads import side_by_side
-from mipmap_plugin.scenes.trajectories import Orbit, jittered, with_company
+from mipmap_plugin.scenes.orbits import Orbit
+from mipmap_plugin.scenes.trajectories import jittered, with_company
 
 # At most one in this many of the given cameras is kept for validation, where the policy leaves the choice of views to us.
 VALIDATION_EVERY = 16

@@ -1,0 +1,166 @@
+"""Views around a scene that came without cameras."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera, viewmat_of
+from mipmap_plugin.effects import NEAR_PLANE
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.gaussians import Gaussians
+
+ORBIT_FOV = math.radians(50)  # along the shorter side: a normal lens
+
+# Elevations of an orbit's views, degrees: where the vertical is guessed, typical of handheld cameras; where somebody says it, what people look at
+# an object from. From 10 to 50 there too, lego and chair at x1/4 gain 0.5 and 0.9 dB between 20 and 50, and lose 3.6 above and 1.5 below.
+HANDHELD, ABOVE, ALL = (10.0, 50.0), (-10.0, 80.0), (-90.0, 90.0)
+
+# Fraction of the splats that an orbit frames; the farthest tenth are mostly floaters and background.
+FRAMED = 0.9
+
+# An object by itself has none of these: WHOLE of its splats lie within TIGHT times the radius that frames most. Of eleven objects cut out of captures
+# or rendered it is at most 1.3 times (a guitar lost its head by FRAMED, a statue its upper half), of seven captures at least 1.5.
+WHOLE, TIGHT = 0.995, 1.4
+
+# Largest ratio of the extent along y to those along x and z at which y is assumed to be vertical.
+FLATTER = 0.8
+
+# What pictures have upwards where nothing tells the vertical: as in most files, whose y is down (COLMAP).
+Y_DOWN = (0.0, -1.0, 0.0)
+
+# What may be said to be up, by name.
+AXES = {
+    "x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0), "-x": (-1.0, 0.0, 0.0), "-y": Y_DOWN, "-z": (0.0, 0.0, -1.0),
+}  # fmt: skip
+
+# Places at multiples of the golden ratio are spread evenly, however many there are.
+GOLDEN = (math.sqrt(5) - 1) / 2
+
+
+@dataclass(frozen=True)
+class Orbit:
+    """What an orbit goes around, in world units: `center`, the vertical `up` (None: not known), and how far away its cameras are.
+
+    `said`: the user or the base's files say what is up; otherwise it is guessed from the splats (`guess_up`).
+    """
+
+    center: tuple[float, float, float]
+    up: tuple[float, float, float] | None
+    distance: float
+    said: bool = False
+
+    @classmethod
+    def around(cls, means: Tensor, up: Sequence[float] | None = None) -> Orbit:
+        """Around `means` [N, 3], from a distance that frames them as `frame` says. `up` defaults to `guess_up`.
+
+        Raises SettingsError without splats.
+        """
+        means = _finite(means)
+        center, radius, _ = frame(means)
+        distance = max(radius / math.sin(ORBIT_FOV / 2), radius + 2 * NEAR_PLANE)  # a small scene must not lie in front of the near plane
+        x, y, z = center.tolist()
+        vertical = guess_up(means) if up is None else (up[0], up[1], up[2])
+        return cls((x, y, z), vertical, distance)
+
+    def told(self) -> str:
+        """From where its views look, in words."""
+        if self.up is None:
+            return "from all around"
+        name = next((name for name, axis in AXES.items() if axis == self.up), f"({', '.join(f'{part:.3g}' for part in self.up)})")
+        return f"from above the horizon, with {name} up"
+
+    def views(self, size: tuple[int, int], count: int, generator: torch.Generator) -> list[Camera]:
+        """`count` views of `size` (height, width) px: from above the horizon, or from all around where no vertical is known (the highest first)."""
+        if count < 1:
+            raise SettingsError(f"an orbit needs views, but got {count}")
+        center, vertical = (torch.tensor(vector, dtype=torch.float64) for vector in (self.center, self.up or Y_DOWN))
+        vertical = vertical / vertical.norm()
+        guessed = self.up is not None and not self.said
+        elevations = HANDHELD if guessed else ABOVE if self.said else ALL
+        directions = (_sky_directions if guessed else _spiral)(vertical, elevations, count, generator)
+        return [_looking_at(center, center + self.distance * way, vertical, size, f"orbit_{i:04d}") for i, way in enumerate(directions)]
+
+
+def orbit(
+    means: Tensor | Gaussians, size: tuple[int, int], count: int, generator: torch.Generator, up: Sequence[float] | None = None
+) -> list[Camera]:
+    """`count` views of `size` (height, width) px around the scene, for a checkpoint without cameras (`Orbit`).
+
+    Suitable for objects: the positions of the cameras of an unbounded scene do not follow from its splats. Raises SettingsError
+    without splats or views.
+    """
+    return Orbit.around(means.means if isinstance(means, Gaussians) else means, up).views(size, count, generator)
+
+
+def frame(means: Tensor) -> tuple[Tensor, float, bool]:
+    """What pictures of `means` [N, 3] show: a center [3], a radius (world units), and whether that is a whole object.
+
+    An object by itself is shown whole, and of a capture the nine tenths of the splats around the median. Raises SettingsError without splats.
+    """
+    means = _finite(means)
+    median, middle = means.median(dim=0).values, (_quantile(means, WHOLE) + _quantile(means, 1 - WHOLE)) / 2
+    most, whole = (_quantile((means - center).norm(dim=1), share).item() for center, share in ((median, FRAMED), (middle, WHOLE)))
+    return (middle, whole, True) if whole <= TIGHT * most else (median, most, False)
+
+
+def guess_up(means: Tensor) -> tuple[float, float, float] | None:
+    """The likely vertical of the splats at `means` [N, 3]: -y (COLMAP) for a scene clearly flatter along y, as scenes are usually wider than high.
+
+    None for any other: of single objects neither the shape nor the light tells what is up, and files have y down, y up and z up.
+    """
+    x, y, z = (_quantile(means, FRAMED) - _quantile(means, 1 - FRAMED)).tolist()
+    return Y_DOWN if y < FLATTER * min(x, z) else None
+
+
+def _sky_directions(up: Tensor, elevations: tuple[float, float], count: int, generator: torch.Generator) -> Tensor:
+    """Unit vectors [count, 3] at evenly spaced azimuths and random `elevations` (degrees) above the horizon whose normal is `up` (unit)."""
+    start, chance = torch.rand((), generator=generator, dtype=up.dtype), torch.rand(count, 1, generator=generator, dtype=up.dtype)
+    low, high = map(math.radians, elevations)
+    return _directions(up, torch.arange(count, dtype=up.dtype)[:, None] / count + start, torch.sin(low + (high - low) * chance))
+
+
+def _spiral(up: Tensor, elevations: tuple[float, float], count: int, generator: torch.Generator) -> Tensor:
+    """Unit vectors [count, 3] evenly spread within `elevations` (degrees), on a spiral around `up` (unit) from the highest down."""
+    start, chance = torch.rand((), generator=generator, dtype=up.dtype), torch.rand(count, 1, generator=generator, dtype=up.dtype)
+    number = torch.arange(count, dtype=up.dtype)[:, None]
+    low, high = (math.sin(math.radians(each)) for each in elevations)
+    return _directions(up, number * GOLDEN + start, high - (high - low) * (number + chance) / count)
+
+
+def _directions(up: Tensor, turns: Tensor, height: Tensor) -> Tensor:
+    """Unit vectors [count, 3] after `turns` [count, 1] around `up` (unit), at `height` [count, 1] along it (-1 to 1)."""
+    east: Tensor = torch.linalg.cross(up, torch.eye(3, dtype=up.dtype)[up.abs().argmin()])
+    east = east / east.norm()
+    north: Tensor = torch.linalg.cross(up, east)
+    azimuth = turns * 2 * math.pi
+    return (1 - height**2).sqrt() * (azimuth.cos() * east + azimuth.sin() * north) + height * up
+
+
+def _looking_at(target: Tensor, eye: Tensor, up: Tensor, size: tuple[int, int], name: str) -> Camera:
+    """A camera at `eye` that looks at `target`, with `up` upwards. The columns of its rotation are right, down and forward."""
+    forward = (target - eye) / (target - eye).norm()
+    right = torch.linalg.cross(forward, up)
+    right = right / right.norm()
+    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1)
+    height, width = size
+    focal = min(size) / (2 * math.tan(ORBIT_FOV / 2))
+    return Camera(width, height, focal, focal, width / 2, height / 2, viewmat_of(rotation, eye), name)
+
+
+def _finite(means: Tensor) -> Tensor:
+    """The finite ones of `means` [N, 3], as float64 on the CPU. Raises SettingsError if there are none."""
+    means = means.detach().to("cpu", torch.float64)
+    means = means[means.isfinite().all(dim=1)]
+    if len(means) == 0:
+        raise SettingsError("an orbit needs splats, but got 0 finite splats")
+    return means
+
+
+def _quantile(values: Tensor, share: float) -> Tensor:
+    """The value below which `share` of the first dimension lies. torch.quantile refuses more than 16 million values."""
+    return values.kthvalue(max(1, round(share * len(values))), dim=0).values
