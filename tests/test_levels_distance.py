@@ -482,7 +482,7 @@ def test_the_command_makes_levels_by_distance(tmp_path, capsys, command):
 
 @pytest.mark.parametrize("by", ["distance", "zoom"])
 def test_a_ladder_that_ends_within_its_first_band_has_one_level(tmp_path, capsys, command, by):
-    assert cli.main([*command, "--by", by, "--coarsest", "1", "--report", "--json"]) == 0
+    assert cli.main([by if word == "distance" else word for word in (*command, "--coarsest", "1", "--report", "--json")]) == 0
     manifest = json.loads(capsys.readouterr().out)
     assert [level["file"] for level in manifest["levels"]] == ["level_0.ply"] and manifest["switches"] == []
     assert (tmp_path / "out" / "report.html").is_file()

@@ -107,15 +107,17 @@ def test_nothing_is_changed_afterwards():
     assert told.code == signals.INTERRUPTED
 
 
-def test_a_job_whose_worker_is_told_to_end_is_done_again(tmp_path):
-    worker, told = Worker(1), []
+def test_a_job_whose_worker_is_told_to_end_is_done_again(tmp_path, monkeypatch):
+    worker, told, begin = Worker(1), [], Worker.begin
 
-    def tell_once():
+    def begin_and_tell_once(self, job):
+        begin(self, job)
         if not told:
-            told.append(os.kill(worker._process.pid, signal.SIGTERM))
+            told.append(os.kill(self._process.pid, signal.SIGTERM))
 
+    monkeypatch.setattr(Worker, "begin", begin_and_tell_once)
     job = Job(Base(tiny.folder(tmp_path / "base")), tmp_path / "out.ply", 0.5, settings={"steps": 0, "views": "given"})
     try:
-        assert do(job, worker, tell_once).status == "done" and told
+        assert do(job, worker).status == "done" and told
     finally:
         worker.close()

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.parallel import in_batches
 from mipmap_plugin.adaptation.spreading import Halves, places, spread
-from mipmap_plugin.camera import Camera, evenly
+from mipmap_plugin.camera import ONE_PIXEL, Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import derived_seed
@@ -24,7 +24,7 @@ from mipmap_plugin.models.contract import row_opacities
 from mipmap_plugin.models.health import units
 from mipmap_plugin.render_settings import MIN_ALPHA
 from mipmap_plugin.scenes import unread_cameras
-from mipmap_plugin.scenes.orbits import FRAMED, GOLDEN, ORBIT_FOV, Orbit, frame
+from mipmap_plugin.scenes.orbits import FRAMED, GOLDEN, ORBIT_FOV, Orbit, frame, sharp_size
 from mipmap_plugin.scenes.trajectories import jittered, with_company
 
 # A checkpoint without cameras does not say at what resolution it was trained: this many px across 50 degrees is NeRF-Synthetic's.
@@ -141,7 +141,14 @@ def orbit_of(model: SplatModel, up: tuple[float, float, float] | None, means: Te
     where the model has but some of its file.
     """
     recorded = adapted_orbit(model.source)
-    orbit = Orbit.around(model.parameters()["means"] if means is None else means) if recorded is None else Orbit(**recorded)
+    if recorded is None:
+
+        def size() -> float:
+            return sharp_size(model.gaussians(ONE_PIXEL)) if model.traits.same_for_all_views else math.inf
+
+        orbit = Orbit.around(model.parameters()["means"] if means is None else means, sharp=size)
+    else:
+        orbit = Orbit(**recorded)
     return orbit if up is None else replace(orbit, up=up, said=True)
 
 

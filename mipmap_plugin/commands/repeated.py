@@ -17,7 +17,8 @@ def refuse_repeated(command: Callable[..., Any], words: Sequence[str]) -> None:
         return
     hints = get_type_hints(command, include_extras=True)
     for option in options:
-        hint = hints.get(option.removeprefix("--").replace("-", "_"))
-        if options.count(option) > 1 and tyro.conf.UseAppendAction not in getattr(hint, "__metadata__", ()):
+        name = option.removeprefix("--").replace("-", "_")
+        hint, is_switch = hints.get(name), bool in (hints.get(name), hints.get(name.removeprefix("no_")))
+        if options.count(option) > 1 and not is_switch and tyro.conf.UseAppendAction not in getattr(hint, "__metadata__", ()):
             how = ", with all its values behind it" if get_origin(hint) is tuple else ""
             raise SettingsError(f"{option} is given {options.count(option)} times, of which only the last would count; give it once{how}")

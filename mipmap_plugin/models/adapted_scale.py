@@ -32,7 +32,9 @@ def adapted_orbit(source: Path | None) -> dict[str, Any] | None:
     """
     match _record(source).get("orbit"):
         case {"center": [float(), float(), float()] as center, "up": [float(), float(), float()] | None as up, "distance": float() as far, **more}:
-            return {"center": tuple(center), "up": up and tuple(up), "distance": far, "said": more.get("said") is True}
+            nearest = more.get("nearest")
+            known = {"center": tuple(center), "up": up and tuple(up), "distance": far, "said": more.get("said") is True}
+            return known | ({"nearest": nearest} if isinstance(nearest, float) else {})
     return None
 
 

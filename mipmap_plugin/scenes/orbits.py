@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -27,6 +27,13 @@ FRAMED = 0.9
 # or rendered it is at most 1.3 times (a guitar lost its head by FRAMED, a statue its upper half), of seven captures at least 1.5.
 WHOLE, TIGHT = 0.995, 1.4
 
+# Where a capture was seen from is guessed by its splats: of those that can be seen a quarter are smaller than SHARP_PX in the pictures that it was
+# trained on (1.5 to 2.1 px in three bases of two captures). Half of the views are as far away as that is so at SHARP_FOCAL px, the others NEARER, but
+# none is within the middle quarter of the splats. Flowers and a bird at x1/4 have 30 and 35 dB by these, from where they were photographed (base 25
+# and 30; by their cameras 37 and 44). By views that frame the splats, from 4 to 15 times as far away as the cameras, they had 17 and 21.
+SHARP, SHARP_PX, SHARP_FOCAL, NEARER, MIDDLE = 1 / 4, 1.8, 858.0, 1 / 2, 1 / 4
+SEEN_OPACITY = 0.1
+
 # Largest ratio of the extent along y to those along x and z at which y is assumed to be vertical.
 FLATTER = 0.8
 
@@ -46,6 +53,7 @@ GOLDEN = (math.sqrt(5) - 1) / 2
 class Orbit:
     """What an orbit goes around, in world units: `center`, the vertical `up` (None: not known), and how far away its cameras are.
 
+    `nearest`: how far half of them are, if that is not the same (0).
     `said`: the user or the base's files say what is up; otherwise it is guessed from the splats (`guess_up`).
     """
 
@@ -53,19 +61,26 @@ class Orbit:
     up: tuple[float, float, float] | None
     distance: float
     said: bool = False
+    nearest: float = 0.0
 
     @classmethod
-    def around(cls, means: Tensor, up: Sequence[float] | None = None) -> Orbit:
+    def around(cls, means: Tensor, up: Sequence[float] | None = None, sharp: Callable[[], float] = lambda: math.inf) -> Orbit:
         """Around `means` [N, 3], from a distance that frames them as `frame` says. `up` defaults to `guess_up`.
 
-        Raises SettingsError without splats.
+        `sharp`: the size of sharp splats (`sharp_size`), of which a capture is seen from so near that they are about as large as pixels. Raises
+        SettingsError without splats.
         """
         means = _finite(means)
-        center, radius, _ = frame(means)
+        center, radius, whole = frame(means)
         distance = max(radius / math.sin(ORBIT_FOV / 2), radius + 2 * NEAR_PLANE)  # a small scene must not lie in front of the near plane
+        nearest = 0.0
+        if not whole:
+            from_here = sharp() / SHARP_PX * SHARP_FOCAL
+            outside = max(_quantile((means - center).norm(dim=1), MIDDLE).item(), 2 * NEAR_PLANE)
+            distance, nearest = (min(distance, max(far, outside)) for far in (from_here, NEARER * from_here))
         x, y, z = center.tolist()
         vertical = guess_up(means) if up is None else (up[0], up[1], up[2])
-        return cls((x, y, z), vertical, distance)
+        return cls((x, y, z), vertical, distance, nearest=nearest)
 
     def told(self) -> str:
         """From where its views look, in words."""
@@ -83,7 +98,8 @@ class Orbit:
         guessed = self.up is not None and not self.said
         elevations = HANDHELD if guessed else ABOVE if self.said else ALL
         directions = (_sky_directions if guessed else _spiral)(vertical, elevations, count, generator)
-        return [_looking_at(center, center + self.distance * way, vertical, size, f"orbit_{i:04d}") for i, way in enumerate(directions)]
+        far = [self.distance if i * GOLDEN % 1 < 0.5 else self.nearest or self.distance for i in range(count)]
+        return [_looking_at(center, center + far[i] * way, vertical, size, f"orbit_{i:04d}") for i, way in enumerate(directions)]
 
 
 def orbit(
@@ -106,6 +122,18 @@ def frame(means: Tensor) -> tuple[Tensor, float, bool]:
     median, middle = means.median(dim=0).values, (_quantile(means, WHOLE) + _quantile(means, 1 - WHOLE)) / 2
     most, whole = (_quantile((means - center).norm(dim=1), share).item() for center, share in ((median, FRAMED), (middle, WHOLE)))
     return (middle, whole, True) if whole <= TIGHT * most else (median, most, False)
+
+
+def sharp_size(gaussians: Gaussians) -> float:
+    """The size, in world units, than which a quarter of the splats that can be seen are smaller: of a splat, that of its two longer axes.
+
+    Infinite where none can be seen, or shapes are not scales.
+    """
+    seen = (gaussians.opacities >= SEEN_OPACITY) & gaussians.scales.isfinite().all(dim=1)
+    if gaussians.covariances is not None or not seen.any():
+        return math.inf
+    sizes = gaussians.scales[seen].detach().to("cpu", torch.float64).topk(2, dim=1).values.prod(dim=1).sqrt()
+    return float(_quantile(sizes, SHARP))
 
 
 def guess_up(means: Tensor) -> tuple[float, float, float] | None:

@@ -278,11 +278,12 @@ def test_a_picture_is_drawn(tmp_path):
 
 
 def command(tmp_path, *more):
-    folder = tmp_path / "base"
+    """The exit code of a small comparison; what `more` has takes the place of its own."""
+    folder, own = tmp_path / "base", {"--steps": "2", "--views": "1"}
     if not folder.exists():
         tiny.folder(folder, tiny.cameras(3))
-    some = ["--recipe", "default", "--steps", "2", "--supersampling", "2"]
-    some += ["--no-renderers", "--repeats", "1", "--views", "1"]
+    some = ["--recipe", "default", "--supersampling", "2", "--no-renderers", "--repeats", "1"]
+    some += [word for option in own.items() if option[0] not in more for word in option]
     return cli.main(["tradeoff", str(folder), "--scale", "1/4", "--output", str(tmp_path / "new"), "--no-picture", *some, *more])
 
 
