@@ -7,6 +7,7 @@ import importlib.util
 import subprocess
 import sys
 from dataclasses import replace
+from importlib.metadata import version
 from types import SimpleNamespace
 
 import pytest
@@ -23,6 +24,7 @@ from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.splatting.viewers import find_viewer
 
 MISSING = importlib.util.find_spec("triton") is None
+not_old = pytest.mark.skipif(not MISSING and version("triton") < "3.3", reason="triton is older than 3.3, as that of torch 2.5")
 pytestmark = pytest.mark.skipif(interpreted(), reason="under the interpreter nothing is compiled, and the CPU is supported")
 USUAL = Needs("cuda", torch.float32, gradients=True, sh_degree=3, screen_filter="classic")
 
@@ -44,6 +46,7 @@ def compile_for(capability: int, kernel, warps: int = 4, **constants) -> str:
     return compiled.asm["ptx"]
 
 
+@not_old
 @pytest.mark.skipif(MISSING, reason="triton is not installed")
 @pytest.mark.parametrize("capability", [80, pytest.param(75, marks=pytest.mark.slow), pytest.param(90, marks=pytest.mark.slow)])
 def test_the_kernels_compile_where_there_is_no_gpu(capability, tmp_path, monkeypatch):
@@ -174,6 +177,7 @@ def test_what_is_compiled_ahead_is_what_a_run_calls(asked, viewer, by_rows, monk
     assert asked == ahead
 
 
+@not_old
 def test_what_is_missing_is_reported(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert TritonBackend().lacking(USUAL) == [NO_TRITON if MISSING else NO_CUDA]
@@ -187,6 +191,7 @@ def test_what_is_missing_is_reported(monkeypatch):
     assert TritonBackend().lacking(USUAL) == [NO_TRITON]
 
 
+@not_old
 def test_it_is_listed_with_its_reasons_and_refuses(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     reason = NO_TRITON if MISSING else NO_CUDA
