@@ -28,9 +28,10 @@ FRAMED = 0.9
 WHOLE, TIGHT = 0.995, 1.4
 
 # Where a capture was seen from is guessed by its splats: of those that can be seen a quarter are smaller than SHARP_PX in the pictures that it was
-# trained on (1.5 to 2.1 px in three bases of two captures). Half of the views are as far away as that is so in theirs, of SHARP_FOCAL px, the others NEARER,
-# but none is within the middle quarter of the splats. Flowers and a bird at x1/4 have 30 and 35 dB by these, from where they were photographed (base 25
-# and 30; by their cameras 37 and 44). By views that frame the splats, from 4 to 15 times as far away as the cameras, they had 17 and 21.
+# trained on (1.5 to 2.1 px in three bases of two captures). Half of the views are as far away as that is so in theirs, whose focal length is
+# SHARP_FOCAL px, the others NEARER, but none is within the middle quarter of the splats. Flowers and a bird at x1/4 have 30 and 35 dB by these, from
+# where they were photographed (base 25 and 30; by their cameras 37 and 44). By views that frame the splats, from 4 to 15 times as far away as the
+# cameras, they had 17 and 21.
 SHARP, SHARP_PX, NEARER, MIDDLE = 1 / 4, 1.8, 1 / 2, 1 / 4
 SHARP_FOCAL = 400 / math.tan(ORBIT_FOV / 2)  # of pictures of 800 px
 SEEN_OPACITY = 0.1
