@@ -40,12 +40,12 @@ LOOKED_AT, TOO_MANY = 16, 0.05
 # it, unless the near plane keeps it away from a scene in small units; then pictures are of another zoom than a user looks from.
 LEAST_PIXELS, LEAST_SHARE = 16, 0.25
 
-# What is said where there are no cameras: with those of an object all is well, but a capture was never seen from there, and loses 10 dB and more.
+# What is said where there are no cameras: with those of an object all is well, but those of a capture are a guess, which may cost 10 dB and more.
 ORBITED = (
-    "no cameras are known: views of a generated orbit are adapted to, {told}, and all dB are of such; that suits an object, and no capture{seems}; "
+    "no cameras are known: views of a generated orbit are adapted to, {told}, and all dB are of such{seems}; "
     "give the scene's cameras (--cameras)"
 )
-CAPTURE = ", which this seems to be, for many splats lie far outside the orbit's pictures: from where people stand it may look worse than its base"
+CAPTURE = "; this seems to be a capture, and from where it was photographed is a guess by the size of its splats"
 VIEWED = ", or adapt for what you look at (mipmap-plugin view)"
 
 # Ratio of focal lengths, px, of which views want files as different as scales at such a ratio: two lenses at 5 times cost a capture 10 of 12 dB.

@@ -222,7 +222,7 @@ def all_rows(model: Wrapped, judge: Evaluator, scales: Sequence[float], recipes:
     model.targets(viewer)  # raise errors of the viewer, the recipes and the settings before any work
     for name, scale in product(recipes, scales):
         _config(name, scale, settings)
-    model.refuse_undrawn([view.camera for view in judge.views], max(scales))
+    model.refuse_undrawn([view.camera for view in judge.views], min(scales))
     if doubt := of_another_scene(model, judge.views, scales[0], judge.protocol):
         warnings.warn(doubt, stacklevel=2)
     for scale in scales:

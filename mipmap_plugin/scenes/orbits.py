@@ -100,7 +100,8 @@ class Orbit:
         guessed = self.up is not None and not self.said
         elevations = HANDHELD if guessed else ABOVE if self.said else ALL
         directions = (_sky_directions if guessed else _spiral)(vertical, elevations, count, generator)
-        far = [self.distance if i * GOLDEN % 1 < 0.5 else self.nearest or self.distance for i in range(count)]
+        # Two and two: by a part of the turn all near ones would be on one side, and every other view is in the same half of the checks.
+        far = [self.distance if i // 2 % 2 == 0 else self.nearest or self.distance for i in range(count)]
         return [_looking_at(center, center + far[i] * way, vertical, size, f"orbit_{i:04d}") for i, way in enumerate(directions)]
 
 

@@ -84,7 +84,7 @@ def _budget_left(run: Run, config: AdaptConfig) -> float:
 def _truths_take(run: Run, views: Sequence[Camera]) -> float:
     """The seconds that the truths of those views which have none yet are expected to take: of large ones, more than a budget has left."""
     known = run.costs.truths
-    return sum(view not in known for view in views) * max(known.values(), default=0.0)
+    return sum(view not in known for view in views) * sum(known.values()) / max(1, len(known))
 
 
 def is_checked(step: int, config: AdaptConfig) -> bool:

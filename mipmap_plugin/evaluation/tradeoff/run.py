@@ -24,7 +24,7 @@ def run(model: Wrapped, scene: Scene | None, scales: Sequence[float], plan: Plan
         raise SettingsError("at scale 1 the base needs no adaptation; give another scale")
     if views is not None and views < 1:
         raise SettingsError(f"views: at least 1 must be evaluated on, got {views}")
-    model.refuse_undrawn(scale=max(scales))
+    model.refuse_undrawn(scale=min(scales))
     truths = [base_itself(model, scale, views) if scene is None else photographs(model, scene, scale, views) for scale in scales]
     made_from = {"base": model.model.digest, "asked": model.asked, "trained": str(model.trained), "scene": scene and scene.digest()}
     cells = Cells(folder.path / KEPT, made_from | {"views": views, "threads": model.threads})
