@@ -364,7 +364,7 @@ def test_the_time_budget_ends_the_run():
 def test_the_choice_that_is_reserved_for_is_not_told_as_the_start(monkeypatch):
     monkeypatch.setattr(Pace, "of", classmethod(lambda *_: Pace(1.0, 1.0, 1.0, 1e6)))
     report = wrapped().adapt(1 / 4, time_budget_s=1e4, **BRIEF).report
-    assert report.ended_by == "time budget of 10000 s, all of which the start and the choice of a state take"
+    assert report.ended_by == "time budget of 10000 s, not enough for a step beside the start and the choice of a state"
 
 
 def test_steps_that_were_planned_for_a_time_budget_are_told(monkeypatch):

@@ -23,7 +23,9 @@ from mipmap_plugin import registry
 from mipmap_plugin.backends.conformance import CASES, MORE, Outcome
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
+from mipmap_plugin.commands.adapt import adapt
 from mipmap_plugin.commands.outputs import picture_names
+from mipmap_plugin.commands.repeated import refuse_repeated
 from mipmap_plugin.commands.types import read_scale
 from mipmap_plugin.evaluation import backends as backends_module
 from mipmap_plugin.evaluation import viewer_differences
@@ -440,6 +442,7 @@ def test_an_option_that_counts_once_is_not_given_twice(run, model_folder, tmp_pa
     refused(run("evaluate", model_folder, *twice, "--scale", "1/4"), "--images is given 2 times", "; give it once, with all its values behind it\n")
     budgets = ["--time-budget-s", "1", "--time_budget_s", "2"]
     refused(run("adapt", model_folder, "--scale", "1/4", *budgets), "--time-budget-s is given 2 times", "; give it once\n")
+    refuse_repeated(adapt, ["adapt", "--json", "--json", "--scale", "1/4", "--scale", "4", "--seed", "1", "--", "--seed", "--seed"])
 
 
 def test_a_lone_file_is_judged_by_photographs_with_the_cameras_that_are_given(run, tmp_path):

@@ -161,7 +161,7 @@ def test_what_the_choice_takes_of_a_budget_is_told_beside_both_starts(monkeypatc
     monkeypatch.setattr(Pace, "of", classmethod(lambda *_: Pace(1.0, 1.0, 1.0, 1e6)))
     with pytest.warns(UserWarning, match="give [0-9]{7} s or more"):  # of which each stage has a half, and its start half of that
         report = wrapped().adapt(2, viewer="antialiased", time_budget_s=1e4, **BRIEF).report
-    assert report.ended_by == "time budget of 10000 s, all of which the conversion, the start and the choice of a state take"
+    assert report.ended_by == "time budget of 10000 s, not enough for a step beside the conversion, the start and the choice of a state"
 
 
 def test_with_a_budget_too_what_has_ended_is_not_taken_further(tmp_path, monkeypatch):

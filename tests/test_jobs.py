@@ -24,6 +24,7 @@ from mipmap_plugin.camera import digest_of
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.jobs import summary
+from mipmap_plugin.jobs import worker as jobs_worker
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.engines import in_workers, longest_first
 from mipmap_plugin.jobs.finished import finished
@@ -31,7 +32,7 @@ from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.listing import find_checkpoints, read_list, shard, without_outputs
 from mipmap_plugin.jobs.parcel import do_parcel, pack, unpack
 from mipmap_plugin.jobs.run import run as run_job
-from mipmap_plugin.jobs.worker import Worker, do
+from mipmap_plugin.jobs.worker import Worker, WorkerDied, do
 from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.tiles.job import TileJob
 from mipmap_plugin.wrap import Wrapped
@@ -606,3 +607,13 @@ def test_an_interruption_is_told_once(tmp_path):
 def test_without_words_a_checkpoint_is_asked_for(run):
     code, _, err = run("adapt")
     assert code == 2 and "there is no checkpoint to adapt; give a PLY" in err
+
+
+def test_a_worker_that_is_stopped_while_it_starts_begins_nothing(monkeypatch, tmp_path):
+    worker, start = Worker(1), jobs_worker._start
+    monkeypatch.setattr(jobs_worker, "_start", lambda threads: worker.stop() or start(threads))
+    try:
+        with pytest.raises(WorkerDied, match="was stopped"):
+            worker.begin(Job(Base(tmp_path), tmp_path / "out.ply", 0.5))
+    finally:
+        worker.close()

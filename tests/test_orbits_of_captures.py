@@ -35,6 +35,17 @@ def test_it_is_seen_from_where_sharp_splats_have_the_size_of_pixels_and_from_nea
     assert int((torch.isclose(far, far.new_tensor(orbit.distance)) | torch.isclose(far, far.new_tensor(orbit.nearest))).sum()) == 40
 
 
+@pytest.mark.parametrize("up", [None, (0.0, 0.0, 1.0)], ids=["not known", "said"])
+def test_near_and_far_views_are_on_all_sides(up):
+    orbit = replace(seen_from(30.0), up=up, said=up is not None)
+    views = orbit.views((8, 8), 80, torch.Generator().manual_seed(0))
+    ways = torch.stack([view.center.double() for view in views]) - torch.tensor(orbit.center, dtype=torch.float64)
+    far, level = ways.norm(dim=1) > 20, ways[:, :2] if up else ways[:, [0, 2]]
+    level = level / level.norm(dim=1, keepdim=True)
+    assert all(float(level[chosen].mean(0).norm()) < 0.2 for chosen in (far, ~far))  # 0.6 where they are on one half of the turn
+    assert all(0.3 < float(far[half::2].double().mean()) < 0.7 for half in (0, 1))  # of both halves of the checks
+
+
 def test_from_farther_than_where_the_most_of_it_is_framed_it_is_not_seen():
     framed = Orbit.around(capture()).distance
     assert seen_from(1e9) == replace(seen_from(1e9), distance=framed, nearest=framed)

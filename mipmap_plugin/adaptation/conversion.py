@@ -69,7 +69,7 @@ class Stages:
         base = self.request.images.model
         refuse_adapted(base.source)
         if not self.cameras and config.views != "orbit":
-            warn(orbited(base.source, orbit_of(base, self.request.up), base.parameters()["means"]))
+            warn(orbited(base.source, orbit_of(base, self.request.up)))
         refuse_broken(base, next(iter(self.cameras), ONE_PIXEL), steps=config.steps > 0)
         near = self.request.images.effects.near_plane
         # The splats of a moving scene are elsewhere at other moments.

@@ -181,7 +181,7 @@ class Session:
             keeper.save_if_due(run)
             try:
                 return is_true(observe and observe(run.step, run.watch.seconds, first.of_model(run.student)))
-            except KeyboardInterrupt:
+            except KeyboardInterrupt:  # as between two steps
                 keeper.save_and_stop(run)
 
         if run.ended_by is None:

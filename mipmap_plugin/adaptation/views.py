@@ -24,7 +24,7 @@ from mipmap_plugin.models.contract import row_opacities
 from mipmap_plugin.models.health import units
 from mipmap_plugin.render_settings import MIN_ALPHA
 from mipmap_plugin.scenes import unread_cameras
-from mipmap_plugin.scenes.orbits import FRAMED, GOLDEN, ORBIT_FOV, Orbit, frame, sharp_size
+from mipmap_plugin.scenes.orbits import FRAMED, GOLDEN, ORBIT_FOV, Orbit, sharp_size
 from mipmap_plugin.scenes.trajectories import jittered, with_company
 
 # A checkpoint without cameras does not say at what resolution it was trained: this many px across 50 degrees is NeRF-Synthetic's.
@@ -45,7 +45,7 @@ ORBITED = (
     "no cameras are known: views of a generated orbit are adapted to, {told}, and all dB are of such{seems}; "
     "give the scene's cameras (--cameras)"
 )
-CAPTURE = "; this seems to be a capture, and from where it was photographed is a guess by the size of its splats"
+CAPTURE = "; this seems to be a capture, and from where it was photographed is a guess: seen from there it may look worse than its base"
 VIEWED = ", or adapt for what you look at (mipmap-plugin view)"
 
 # Ratio of focal lengths, px, of which views want files as different as scales at such a ratio: two lenses at 5 times cost a capture 10 of 12 dB.
@@ -256,9 +256,9 @@ def too_small(views: Sequence[Camera], model: SplatModel, near: float, least: fl
     return f"the scene is {units(width, 2)} units wide, and no view shows it larger than {units(most, 2)} px: {wrong}"
 
 
-def orbited(source: Path | None, orbit: Orbit, means: Tensor) -> str:
-    """What is said of views of an orbit around `means` [N, 3]: `ORBITED`, with the cameras.json that lies beside the file of the splats."""
-    file, whole = unread_cameras(source), frame(means)[2]
+def orbited(source: Path | None, orbit: Orbit) -> str:
+    """What is said of views of an orbit: `ORBITED`, with the cameras.json that lies beside the file of the splats."""
+    file, whole = unread_cameras(source), not orbit.nearest
     beside = f", such as {file}, if it is of this scene" if file else ""
     others = ("" if whole else VIEWED) + ("" if orbit.up else ", or say what is up (--up z, for one)")
     return f"{ORBITED.format(told=orbit.told(), seems='' if whole else CAPTURE)}{beside}{others}"

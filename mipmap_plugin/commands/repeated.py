@@ -12,7 +12,8 @@ from mipmap_plugin.errors import SettingsError
 
 def refuse_repeated(command: Callable[..., Any], words: Sequence[str]) -> None:
     """Raise SettingsError for an option of `command` that is given twice and may not be: the parser takes the last one and says nothing."""
-    options = [word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")]
+    words = words[: words.index("--")] if "--" in words else words  # behind it are names of files
+    options = [word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--") and word != "--help"]
     if len(set(options)) == len(options):
         return
     hints = get_type_hints(command, include_extras=True)

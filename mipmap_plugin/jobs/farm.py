@@ -6,6 +6,7 @@ without its dask worker. If a dask worker dies, the scheduler gives its job to a
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import re
@@ -124,7 +125,7 @@ def _stopped_by(stop: Event, worker: Worker) -> Iterator[None]:
 
     def watch() -> None:
         while not ended.wait(PERIOD_S):
-            with suppress(OSError):  # a scheduler that cannot be reached now
+            with suppress(OSError, asyncio.TimeoutError):  # a scheduler that cannot be reached now
                 if stop.is_set():
                     return worker.stop()
 
@@ -177,7 +178,7 @@ def _kept_workers(client: Client, place: str) -> Iterator[None]:
         while not ended.wait(LOOK_S):
             if client.cluster is not None:
                 client.cluster.scale(len(client.cluster.worker_spec))
-            with suppress(OSError):  # a scheduler that cannot be reached now is found again, or ends the jobs
+            with suppress(OSError, asyncio.TimeoutError):  # a scheduler that cannot be reached now is found again, or ends the jobs
                 looks = 0 if client.scheduler_info(n_workers=1)["workers"] else looks + 1
                 if looks == 2:
                     note(f"--dask {place}: there are no workers, so nothing is done until one comes; Ctrl-C ends this, and the same command goes on")

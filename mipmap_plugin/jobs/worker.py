@@ -40,6 +40,8 @@ class Worker:
         if self.stopped:
             raise WorkerDied("the worker was stopped")
         self._process = self._process or _start(self.threads)
+        if self.stopped:  # from another thread, before there was a process to tell
+            raise WorkerDied("the worker was stopped")
         stream = cast(IO[bytes], self._process.stdin)
         try:
             pickle.dump((job, self.threads), stream)

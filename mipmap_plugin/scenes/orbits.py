@@ -113,7 +113,10 @@ def orbit(
     Suitable for objects: the positions of the cameras of an unbounded scene do not follow from its splats. Raises SettingsError
     without splats or views.
     """
-    return Orbit.around(means.means if isinstance(means, Gaussians) else means, up).views(size, count, generator)
+    if isinstance(means, Gaussians):
+        gaussians = means
+        return Orbit.around(gaussians.means, up, lambda: sharp_size(gaussians)).views(size, count, generator)
+    return Orbit.around(means, up).views(size, count, generator)
 
 
 def frame(means: Tensor) -> tuple[Tensor, float, bool]:

@@ -106,10 +106,10 @@ class TiledScene:
 
     @cached_property
     def views(self) -> Views:
-        """The views of the whole scene, the same as without tiles."""
+        """The views of the whole scene, as without tiles; how near those of a capture without cameras are is told by a sample of its splats."""
         cameras, orbit = seeing(self.wrapped.cameras, self.base.places[:, :3], self.target.near_plane), self.orbit
         if not cameras and self.config.views != "orbit":
-            warnings.warn(orbited(self.checkpoint.path, orbit, self.base.places[:, :3]), stacklevel=1)
+            warnings.warn(orbited(self.checkpoint.path, orbit), stacklevel=1)
         chosen, note = choose_views(cameras, orbit, self.config)
         adapted, validation = split_validation(cameras, chosen, orbit, self.scale, self.config)
         note += f", {len(chosen) - len(adapted)} of them kept for validation" if len(adapted) < len(chosen) else ""

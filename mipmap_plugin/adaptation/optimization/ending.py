@@ -29,7 +29,8 @@ class End(Enum):
             case End.START:
                 return f"{budget}, all of which {'the start' if share == 1 else 'the conversion and the start'} took"
             case End.CHOICE:
-                return f"{budget}, all of which {'the start' if share == 1 else 'the conversion, the start'} and the choice of a state take"
+                start = "the start" if share == 1 else "the conversion, the start"
+                return f"{budget}, not enough for a step beside {start} and the choice of a state"
             case End.TARGET:
                 return f"target of {config.target_db:g} dB against the pseudo truth"
             case End.KNEE:

@@ -54,9 +54,6 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
         while reason is None and run.step < config.steps:
             with run.watch:
                 views = order(run.step, run.progress(config))
-                if run.step and _budget_left(run, config) < _truths_take(run, views):
-                    reason = End.TIME
-                    break
                 _make_truths(run, task, config, order, views)
                 with run.threads.step(len(views), run.costs):
                     _step(run, task, config, views, cameras)
@@ -67,7 +64,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
             bar.update()
             if run.curve[-1].step == run.step:
                 bar.set_postfix_str(f"{run.curve[-1].validation_db:.2f} dB, {run.curve[-1].gaussians} splats")
-            reason = End.OBSERVER if observe(run) else run.reason_to_stop(config)
+            reason = End.OBSERVER if observe(run) else run.reason_to_stop(config) or _no_time_for_truths(run, config, order)
             if interrupted():
                 on_interrupt(run)
         with run.watch:
@@ -81,10 +78,11 @@ def _budget_left(run: Run, config: AdaptConfig) -> float:
     return math.inf if config.time_budget_s is None else max(0.0, config.time_budget_s - run.seconds)
 
 
-def _truths_take(run: Run, views: Sequence[Camera]) -> float:
-    """The seconds that the truths of those views which have none yet are expected to take: of large ones, more than a budget has left."""
-    known = run.costs.truths
-    return sum(view not in known for view in views) * sum(known.values()) / max(1, len(known))
+def _no_time_for_truths(run: Run, config: AdaptConfig, order: ViewSchedule) -> End | None:
+    """Why there is no next step, where the truths that it needs anew are expected to take longer than is left: large ones take seconds."""
+    known, views = run.costs.truths, order(run.step, run.progress(config)) if run.step < config.steps else []
+    takes = sum(view not in known for view in views) * sum(known.values()) / max(1, len(known))
+    return End.TIME if takes > _budget_left(run, config) else None
 
 
 def is_checked(step: int, config: AdaptConfig) -> bool:

@@ -108,7 +108,7 @@ class Run:
     ended_by: End | None = None  # None while it takes steps
     by_rows: ByRows | None = None  # the student, while the backend moves it
     threads: QuickestThreads = field(default_factory=QuickestThreads)
-    reserved: float = 0.0  # seconds of a time budget for what comes after the steps
+    reserved: float = 0.0  # seconds of a time budget for what comes after the steps, and for a step that does not fit
     planned: int = 0  # steps for the time budget; 0: not planned (yet)
 
     @classmethod

@@ -11,8 +11,8 @@ import torch
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.process.clock import now
 
-# px: smaller views are not weighed, along the geometric mean of their sides: one then takes a twentieth of a second. And the fraction of the time
-# left that weighing the first views may take: the same is done again for the closed form.
+# px, the geometric mean of a view's sides: to weigh them views are made no smaller, for one of this size takes a twentieth of a second. And the
+# fraction of the time left that weighing the first views may take: the same is done again for the closed form.
 LEAST_SIDE, WEIGHING = 1000, 1 / 3
 
 
