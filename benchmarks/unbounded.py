@@ -105,7 +105,7 @@ class BaseEvaluator(Evaluator):
 def split(base: Wrapped, capture: Capture) -> tuple[list[Camera], list[Camera]]:
     """The views to judge, and the cameras that are left to adapt to; none: an orbit is generated."""
     if capture.every is None:
-        return choose_views([], base.orbit(), AdaptConfig(seed=EVALUATION_SEED, extra_views=ORBIT_VIEWS))[0], []
+        return choose_views([], base.viewpoints, AdaptConfig(seed=EVALUATION_SEED, extra_views=ORBIT_VIEWS))[0], []
     cameras = sorted((replace(camera.zoomed(capture.share), split="train", zoom=1.0) for camera in base.cameras), key=lambda camera: camera.name)
     return cameras[:: capture.every], [camera for number, camera in enumerate(cameras) if number % capture.every]
 

@@ -20,7 +20,8 @@ from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import LIMIT, BaseImages
 from mipmap_plugin.adaptation.target.photographs import Photographs, placed
 from mipmap_plugin.adaptation.target.portable import settings_for_several
-from mipmap_plugin.adaptation.views import choose_views, orbit_of, refuse_blind
+from mipmap_plugin.adaptation.viewpoints import ClearViews, Viewpoints, orbit_of
+from mipmap_plugin.adaptation.views import choose_views, refuse_blind
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
 from mipmap_plugin.camera import ONE_PIXEL, Camera, checked, digest_of, of_base_scale
@@ -40,7 +41,6 @@ from mipmap_plugin.process import threads
 from mipmap_plugin.process.torch_modes import usual_modes
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
-from mipmap_plugin.scenes.orbits import Orbit
 from mipmap_plugin.screen_filters import DILATION, USUAL_EPS2D, check_screen_filter
 from mipmap_plugin.splatting.filters import INTEGRALS
 from mipmap_plugin.splatting.viewers import find_viewer, own_name, viewers_for
@@ -203,7 +203,7 @@ class FrozenBase:
             raise SettingsError(f"start: x{finer.scale:g} is not finer than x{scale:g}; leave it out")
         base_in_viewer = model if (in_viewer := self.read_by(viewer)) is self.model else in_viewer
         base_images = self._base_images(model, backend, self.keeps_images or first is not None)
-        request = AdaptationRequest(base_images, targets, viewer, note, has_gradients, base_in_viewer, finer, inputs, self.trained.up)
+        request = AdaptationRequest(base_images, targets, viewer, note, has_gradients, self.viewpoints, base_in_viewer, finer, inputs)
         family, theirs = f"family {model.family!r}", {f"backend {backend.name!r}": getattr(backend, "theirs", backend)}
         alone = threads.limited_for(backend, self.threads)
         with alone, torch.enable_grad(), naming_any({family: model, **theirs}), unchanged(family, model.parameters()):
@@ -270,16 +270,16 @@ class FrozenBase:
     @usual_modes()
     def views(self) -> list[Camera]:
         """The checkpoint's cameras, or a generated orbit, for an adapted file that of its base, if it came without any."""
-        return self.cameras or choose_views([], self.orbit(), AdaptConfig())[0]
+        return self.cameras or choose_views([], replace(self.viewpoints, clear=list), AdaptConfig())[0]
 
-    def orbit(self) -> Orbit:
-        """What views without cameras go around. Raises SettingsError without splats."""
-        return orbit_of(self.model, self.trained.up)
+    @cached_property
+    def viewpoints(self) -> Viewpoints:
+        """Where views without cameras are. Raises SettingsError without splats."""
+        return Viewpoints(orbit_of(self.model, self.trained.up), ClearViews(self.model, lambda: self.backend()[0], self.effects()))
 
     def refuse_undrawn(self, views: Sequence[Camera] | None = None, scale: float = 1.0) -> None:
         """Raise SettingsError if none of the views, by default the base's own, shows anything of it at `scale` (`refuse_blind`)."""
-        looked_from = self.views() if views is None else views
-        refuse_blind(looked_from, self.model, self.effects().near_plane, lambda view: self.render(view).image, scale)
+        refuse_blind(self.views() if views is None else views, self.model, self.effects().near_plane, lambda view: self.render(view).image, scale)
 
     def place(self, scene: Scene) -> Scene:
         """Return the scene in the model's frame (`placed`); a checkpoint that came without cameras gets those of the scene."""

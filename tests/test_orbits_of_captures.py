@@ -7,7 +7,7 @@ import tiny
 import torch
 
 from mipmap_plugin import wrap_model
-from mipmap_plugin.adaptation.views import orbit_of
+from mipmap_plugin.adaptation.viewpoints import orbit_of
 from mipmap_plugin.scenes.orbits import MIDDLE, NEARER, SHARP_FOCAL, SHARP_PX, Orbit, frame, sharp_size
 
 COUNT = 400
@@ -68,6 +68,14 @@ def test_sharp_splats_are_those_that_can_be_seen():
     opacities = torch.tensor([0.5, 0.5, 0.5, 0.5, 0.01, 0.01, float("nan"), 0.0], dtype=splats.opacities.dtype)
     assert sharp_size(replace(splats, scales=scales, opacities=opacities)) == pytest.approx(2)
     assert sharp_size(replace(splats, opacities=0 * opacities.nan_to_num())) == float("inf")
+
+
+def test_sharp_splats_are_those_of_the_inner_half():
+    splats = tiny.gaussians(9)
+    far = torch.tensor([0.0, 0.1, -0.1, 0.2, -0.2, 5.0, -5.0, 6.0, -6.0], dtype=splats.means.dtype)
+    means = far[:, None] * torch.ones(3, dtype=far.dtype)
+    sizes = torch.tensor([1.0, 1.0, 2.0, 3.0, 3.0, 9.0, 9.0, 9.0, 9.0], dtype=far.dtype)[:, None].expand(9, 3)
+    assert sharp_size(replace(splats, means=means, scales=sizes, opacities=torch.ones_like(far))) in (1, 2)
 
 
 def test_what_is_adapted_is_seen_from_the_same_places(tmp_path):

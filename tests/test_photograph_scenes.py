@@ -10,6 +10,7 @@ from plyfile import PlyData, PlyElement
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation.optimization.validation import split_validation
+from mipmap_plugin.adaptation.viewpoints import Viewpoints
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.evaluation.tradeoff.truth import base_itself, unseen
@@ -43,8 +44,9 @@ def test_the_camera_is_that_of_the_photograph(tmp_path, text):
 @pytest.mark.parametrize("scale", [1 / 2, 2])
 def test_views_to_its_sides_are_adapted_to_and_validated_by(scale):
     lone, orbit, config = tiny.cameras(1), Orbit((0.0, 0.0, 0.0), None, 1.0), recipe("default", scale, views="jittered", extra_views=4)
-    views, _ = choose_views(lone, orbit, config)
-    adapted, validation = split_validation(lone, views, orbit, scale, config)
+    viewpoints = Viewpoints(orbit, list)
+    views, _ = choose_views(lone, viewpoints, config)
+    adapted, validation = split_validation(lone, views, viewpoints, scale, config)
     for seen in adapted[1:], validation:
         assert max((view.center - lone[0].center).norm() for view in seen) > SWAY / 4
 

@@ -11,6 +11,7 @@ from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
+from mipmap_plugin.adaptation.viewpoints import Viewpoints
 from mipmap_plugin.adaptation.views import Rounds, ViewSchedule, choose_views, extent
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import evenly
@@ -112,7 +113,7 @@ def test_an_unknown_upsampler_is_refused_before_anything_is_rendered():
 
 def chosen(views, cameras=None, **settings):
     cameras = tiny.cameras(4) + tiny.cameras(2, seed=5, split="test") if cameras is None else cameras
-    return choose_views(cameras, Orbit.around(tiny.gaussians().means), AdaptConfig(views=views, **settings)), cameras
+    return choose_views(cameras, Viewpoints(Orbit.around(tiny.gaussians().means), list), AdaptConfig(views=views, **settings)), cameras
 
 
 @pytest.mark.parametrize(

@@ -101,7 +101,7 @@ def test_a_report_without_an_orbit_is_taken_as_one_of_before(files, orbit):
 def test_a_header_tells_the_vertical_but_for_what_a_program_writes_into_every_file(tmp_path, comment, up):
     base = tiny.ply(tmp_path / "base.ply")
     base.write_bytes(base.read_bytes().replace(b"element vertex", f"comment {comment}\nelement vertex".encode(), 1))
-    assert wrap_model(base).orbit().up == up
+    assert wrap_model(base).viewpoints.orbit.up == up
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_a_header_tells_the_vertical_but_for_what_a_program_writes_into_every_fi
 )
 def test_a_project_that_turns_its_scenes_tells_the_vertical(tmp_path, make, up):
     base = wrap_model(make(tmp_path / "r", splats()))
-    assert base.orbit().up == up
+    assert base.viewpoints.orbit.up == up
     adapted = base.adapt(SCALE, recipe="instant", extra_views=40)
     assert (min(heights(adapted.adapted_to)) > -0.2) == bool(up) and (", with z up," in adapted.report.views) == bool(up)
 

@@ -33,6 +33,7 @@ from mipmap_plugin.adaptation.optimization.validation import (
 from mipmap_plugin.adaptation.renderers import Renderer
 from mipmap_plugin.adaptation.start import candidates as start
 from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.adaptation.viewpoints import Viewpoints
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.formats.ply import read_ply
@@ -42,7 +43,7 @@ from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes.orbits import Orbit
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
-ORBIT = Orbit.around(tiny.gaussians().means)
+VIEWPOINTS = Viewpoints(Orbit.around(tiny.gaussians().means), list)
 SCALE = 1 / 4
 
 # So bold that every step does harm.
@@ -64,8 +65,8 @@ def same(model, other) -> bool:
 
 def held_back(cameras, policy, scale=SCALE, **settings):
     config = recipe("default", scale, **{"views": policy, "extra_views": 8, **settings})
-    views, _ = choose_views(cameras, ORBIT, config)
-    return split_validation(cameras, views, ORBIT, scale, config)
+    views, _ = choose_views(cameras, VIEWPOINTS, config)
+    return split_validation(cameras, views, VIEWPOINTS, scale, config)
 
 
 def poses(views):
@@ -83,7 +84,7 @@ def test_no_view_of_validation_is_adapted_to(policy):
 @pytest.mark.parametrize(("policy", "kept"), [("train", 2), ("jittered", 2), ("given", 0), ("test", 0), ("orbit", 0)])
 def test_given_cameras_are_kept_back_only_where_the_choice_is_ours(policy, kept):
     cameras = tiny.cameras(MANY) + tiny.cameras(MANY, seed=2, split="test")
-    wanted, _ = choose_views(cameras, ORBIT, recipe("default", SCALE, views=policy, extra_views=8))
+    wanted, _ = choose_views(cameras, VIEWPOINTS, recipe("default", SCALE, views=policy, extra_views=8))
     left, judged = held_back(cameras, policy)
     assert len(poses(cameras) & poses(judged)) == len(wanted) - len(left) == kept
 

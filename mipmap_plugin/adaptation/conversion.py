@@ -22,7 +22,7 @@ from mipmap_plugin.adaptation.seeing import seeing
 from mipmap_plugin.adaptation.session import Session
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.photographs import Photographs
-from mipmap_plugin.adaptation.views import orbit_of, orbited
+from mipmap_plugin.adaptation.views import orbited
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import ONE_PIXEL, Camera
 from mipmap_plugin.config import AdaptConfig
@@ -69,7 +69,7 @@ class Stages:
         base = self.request.images.model
         refuse_adapted(base.source)
         if not self.cameras and config.views != "orbit":
-            warn(orbited(base.source, orbit_of(base, self.request.up)))
+            warn(orbited(base.source, self.request.viewpoints.orbit))
         refuse_broken(base, next(iter(self.cameras), ONE_PIXEL), steps=config.steps > 0)
         near = self.request.images.effects.near_plane
         # The splats of a moving scene are elsewhere at other moments.

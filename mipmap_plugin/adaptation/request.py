@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import BaseImages
+from mipmap_plugin.adaptation.viewpoints import Viewpoints
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.models.base import SplatModel
@@ -27,8 +28,8 @@ class AdaptationRequest:
     viewer: str | None  # the viewer (or group of viewers) that the file is made for; None: what draws as the training did
     backend_note: str  # which backend was chosen, and why
     has_gradients: bool  # whether the backend has gradients for this request
+    viewpoints: Viewpoints  # where generated views are
     base_in_viewer: SplatModel  # what the viewer reads of the base's own file: mostly the base itself
     finer: FinerLevel | None = None  # what the run starts from instead of the base
     inputs: Mapping[str, str] = field(default_factory=dict)  # `Report.inputs`
-    up: tuple[float, float, float] | None = None  # the vertical of generated views; None: not known
     budget_share: float = 1.0  # of the time budget that was asked for, which the settings have

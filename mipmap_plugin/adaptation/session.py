@@ -35,7 +35,7 @@ from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views import choose_views, orbit_of, over_band, refuse_blind, remarks, showing, too_unlike
+from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind, remarks, showing, too_unlike
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
@@ -67,7 +67,7 @@ class Session:
         self.asked, config = asked, affordable_for_model(asked, self.base, cameras, near)
         self.scale, self.config, self.viewer, self._base_in_viewer = scale, config, request.viewer, request.base_in_viewer
         self.finer, self.inputs, self.budget_share = request.finer, dict(request.inputs), request.budget_share
-        self.device, self.orbit = self.base.parameters()["means"].device, orbit_of(self.base, request.up)
+        self.device, self.viewpoints = self.base.parameters()["means"].device, request.viewpoints
         self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.device)
         self._has_photographs, self._orbits = real is not None, not cameras or config.views == "orbit"
         self.base_views, validation, self.views_note = self._choose_views(cameras)
@@ -88,8 +88,8 @@ class Session:
 
     def _choose_views(self, cameras: list[Camera]) -> tuple[list[Camera], list[Camera], str]:
         """The views to adapt to, the views for validation, and a description of the former."""
-        chosen, note = choose_views(cameras, self.orbit, self.config)
-        views, validation = split_validation(cameras, chosen, self.orbit, self.scale, self.config)
+        chosen, note = choose_views(cameras, self.viewpoints, self.config)
+        views, validation = split_validation(cameras, chosen, self.viewpoints, self.scale, self.config)
         note += f", {len(chosen) - len(views)} of them kept for validation" if len(views) < len(chosen) else ""
         shown = showing(validation, self.base.parameters()["means"], self.base_effects.near_plane)
         if len(shown) > 1:  # one to steer by, and one to choose by; others are the same in every state
@@ -273,6 +273,6 @@ class Session:
             curve=curve,
             versions=versions(),
             inputs=self.inputs,
-            orbit=self.orbit,
+            orbit=self.viewpoints.orbit,
             notes=[*doubts_in(self.base.notes), *notes, *changes(self.base, student)],
         )

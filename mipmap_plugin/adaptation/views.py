@@ -14,17 +14,17 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.parallel import in_batches
 from mipmap_plugin.adaptation.spreading import Halves, places, spread
-from mipmap_plugin.camera import ONE_PIXEL, Camera, evenly
+from mipmap_plugin.adaptation.viewpoints import Viewpoints
+from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import derived_seed
-from mipmap_plugin.models.adapted_scale import adapted_orbit
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.contract import row_opacities
 from mipmap_plugin.models.health import units
 from mipmap_plugin.render_settings import MIN_ALPHA
 from mipmap_plugin.scenes import unread_cameras
-from mipmap_plugin.scenes.orbits import FRAMED, GOLDEN, ORBIT_FOV, Orbit, sharp_size
+from mipmap_plugin.scenes.orbits import FRAMED, GOLDEN, ORBIT_FOV, Orbit
 from mipmap_plugin.scenes.trajectories import jittered, with_company
 
 # A checkpoint without cameras does not say at what resolution it was trained: this many px across 50 degrees is NeRF-Synthetic's.
@@ -134,33 +134,16 @@ def extent(views: Sequence[Camera]) -> float:
     return radius if radius > 0 else 1.0
 
 
-def orbit_of(model: SplatModel, up: tuple[float, float, float] | None, means: Tensor | None = None) -> Orbit:
-    """What an orbit around a model goes around. That of an adapted file is its base's, so that both are seen from the same places.
-
-    `up`: the vertical, as the user or the base's files say (`wrap.Wrapped.trained`); None: they do not. `means` [N, 3]: of all splats,
-    where the model has but some of its file.
-    """
-    recorded = adapted_orbit(model.source)
-    if recorded is None:
-
-        def size() -> float:
-            return sharp_size(model.gaussians(ONE_PIXEL)) if model.traits.same_for_all_views else math.inf
-
-        orbit = Orbit.around(model.parameters()["means"] if means is None else means, sharp=size)
-    else:
-        orbit = Orbit(**recorded)
-    return orbit if up is None else replace(orbit, up=up, said=True)
-
-
-def choose_views(cameras: Sequence[Camera], orbit: Orbit, config: AdaptConfig) -> tuple[list[Camera], str]:
-    """Return the base-scale cameras to adapt to, and a description of them. `orbit`: what generated views go around.
+def choose_views(cameras: Sequence[Camera], viewpoints: Viewpoints, config: AdaptConfig) -> tuple[list[Camera], str]:
+    """Return the base-scale cameras to adapt to, and a description of them. `viewpoints`: where generated views are.
 
     Raises SettingsError when the policy finds no cameras.
     """
     generator = torch.Generator().manual_seed(config.seed)
     if config.views == "orbit" or not cameras:
         pixels = math.ceil(2 * math.tan(ORBIT_FOV / 2) * cameras[0].fx) if cameras else ORBIT_PIXELS  # the cameras' own focal length
-        views = orbit.views((pixels, pixels), config.extra_views or ORBIT_VIEWS, generator)
+        orbit, count = viewpoints.orbit, config.extra_views or ORBIT_VIEWS
+        views = viewpoints.views((pixels, pixels), count, generator)
         reason = "as requested" if cameras else "the checkpoint came without cameras"
         told = f" {orbit.told()}," if orbit.up else ""
         return views, f"{len(views)} views of a generated orbit{told} at {pixels} px ({reason})"
@@ -171,7 +154,7 @@ def choose_views(cameras: Sequence[Camera], orbit: Orbit, config: AdaptConfig) -
     if not views:
         raise SettingsError(f"there are no {split} views among the {len(cameras)} cameras; use the view policy 'given'")
     if config.views == "jittered":
-        extra = jittered(with_company(views, orbit), config.extra_views, generator)
+        extra = jittered(with_company(views, viewpoints.orbit), config.extra_views, generator)
         return views + extra, f"{len(views)} train views and {len(extra)} around them"
     return views, f"the {len(views)} {split} views"
 

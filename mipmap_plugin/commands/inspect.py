@@ -73,7 +73,7 @@ def _facts(checkpoint: Path, wrapped: Wrapped, given: Path | None, *, whole: boo
     from mipmap_plugin.scenes import unread_cameras
 
     model, place = wrapped.model, base_cameras(wrapped, given)
-    orbit = f"; it is looked at {wrapped.orbit().told()}" if not wrapped.cameras and wrapped.orbit().up else ""
+    orbit = f"; it is looked at {wrapped.viewpoints.orbit.told()}" if not wrapped.cameras and wrapped.viewpoints.orbit.up else ""
     with announced("examining"):
         gaussians = model.gaussians(wrapped.views()[0])
         health = examine(model if holds_splats(model) else VanillaModel.from_gaussians(gaussians, model.trained))

@@ -59,7 +59,7 @@ def recorded(base: FrozenBase, requests: Sequence[tuple[float, str | None]], set
     """
     further = {**settings, "most_splats": len(base.model.parameters()["means"])}
     name, digest = further.pop("recipe"), digest_of_model(base.model)
-    made_from = {"base": digest, "inputs": base.asked, "orbit": asdict(base.orbit())}
+    made_from = {"base": digest, "inputs": base.asked, "orbit": asdict(base.viewpoints.orbit)}
     records = [provenance({"scale": scale, "viewer": viewer, **made_from}, recipe(name, scale, **further), versions()) for scale, viewer in requests]
     return max(records, key=lambda record: (wants_filter(record["viewer"]), len(json.dumps(record, default=str))))
 

@@ -35,7 +35,7 @@ class Yardstick:
 
     def __init__(self, base: FrozenBase, seed: int) -> None:
         generator = torch.Generator().manual_seed(derived_seed(seed, DRAW))
-        views = jittered(with_company(base.views(), base.orbit()), TRIED * VIEWS, generator, spread=False)
+        views = jittered(with_company(base.views(), base.viewpoints.orbit), TRIED * VIEWS, generator, spread=False)
         shown = showing(views, base.model.parameters()["means"], base.effects().near_plane)  # between objects far apart there is nothing
         self._views = [view.window(WINDOW, WINDOW) for view in (shown or views)[:VIEWS]]
         self._images = {view: base.render(view).image.clamp(0, 1) for view in self._views}

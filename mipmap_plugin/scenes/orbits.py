@@ -27,12 +27,11 @@ FRAMED = 0.9
 # or rendered it is at most 1.3 times (a guitar lost its head by FRAMED, a statue its upper half), of seven captures at least 1.5.
 WHOLE, TIGHT = 0.995, 1.4
 
-# Where a capture was seen from is guessed by its splats: of those that can be seen a quarter are smaller than SHARP_PX in the pictures that it was
-# trained on (1.5 to 2.1 px in three bases of two captures). Half of the views are as far away as that is so in theirs, whose focal length is
-# SHARP_FOCAL px, the others NEARER, but none is within the middle quarter of the splats. Flowers and a bird at x1/4 have 30 and 35 dB by these, from
-# where they were photographed (base 25 and 30; by their cameras 37 and 44). By views that frame the splats, from 4 to 15 times as far away as the
-# cameras, they had 17 and 21.
-SHARP, SHARP_PX, NEARER, MIDDLE = 1 / 4, 1.8, 1 / 2, 1 / 4
+# Where a capture was seen from is guessed by its splats: of those that can be seen in its inner half, half are smaller than SHARP_PX in the pictures
+# that it was trained on (1.4 to 4.4 px in five captures). Half of the views are as far away as that is so in theirs, whose focal length is
+# SHARP_FOCAL px, the others NEARER, but none is within the middle quarter of the splats. By views that frame the splats, from up to 15 times as far
+# away as the cameras, a bird and flowers are worse than their bases, seen from where they were photographed.
+INNER, SHARP_PX, NEARER, MIDDLE = 1 / 2, 2.0, 1 / 2, 1 / 4
 SHARP_FOCAL = 400 / math.tan(ORBIT_FOV / 2)  # of pictures of 800 px
 SEEN_OPACITY = 0.1
 
@@ -91,8 +90,11 @@ class Orbit:
         name = next((name for name, axis in AXES.items() if axis == self.up), f"({', '.join(f'{part:.3g}' for part in self.up)})")
         return f"from above the horizon, with {name} up"
 
-    def views(self, size: tuple[int, int], count: int, generator: torch.Generator) -> list[Camera]:
-        """`count` views of `size` (height, width) px: from above the horizon, or from all around where no vertical is known (the highest first)."""
+    def views(self, size: tuple[int, int], count: int, generator: torch.Generator, first: int = 0) -> list[Camera]:
+        """`count` views of `size` (height, width) px: from above the horizon, or from all around where no vertical is known (the highest first).
+
+        `first`: the number of the first of them, in their names.
+        """
         if count < 1:
             raise SettingsError(f"an orbit needs views, but got {count}")
         center, vertical = (torch.tensor(vector, dtype=torch.float64) for vector in (self.center, self.up or Y_DOWN))
@@ -102,7 +104,7 @@ class Orbit:
         directions = (_sky_directions if guessed else _spiral)(vertical, elevations, count, generator)
         # Two and two: by a part of the turn all near ones would be on one side, and every other view is in the same half of the checks.
         far = [self.distance if i // 2 % 2 == 0 else self.nearest or self.distance for i in range(count)]
-        return [_looking_at(center, center + far[i] * way, vertical, size, f"orbit_{i:04d}") for i, way in enumerate(directions)]
+        return [_looking_at(center, center + far[i] * way, vertical, size, f"orbit_{first + i:04d}") for i, way in enumerate(directions)]
 
 
 def orbit(
@@ -131,15 +133,21 @@ def frame(means: Tensor) -> tuple[Tensor, float, bool]:
 
 
 def sharp_size(gaussians: Gaussians) -> float:
-    """The size, in world units, than which a quarter of the splats that can be seen are smaller: of a splat, that of its two longer axes.
+    """The median size (`sizes`), in world units, of the splats in the inner half that can be seen: farther out they are larger.
 
     Infinite where none can be seen, or shapes are not scales.
     """
-    seen = (gaussians.opacities >= SEEN_OPACITY) & gaussians.scales.isfinite().all(dim=1)
+    seen = (gaussians.opacities >= SEEN_OPACITY) & gaussians.scales.isfinite().all(dim=1) & gaussians.means.isfinite().all(dim=1)
     if gaussians.covariances is not None or not seen.any():
         return math.inf
-    sizes = gaussians.scales[seen].detach().to("cpu", torch.float64).topk(2, dim=1).values.prod(dim=1).sqrt()
-    return float(_quantile(sizes, SHARP))
+    away = (gaussians.means[seen] - gaussians.means[seen].median(dim=0).values).norm(dim=1)
+    inner = away <= _quantile(away, INNER)
+    return float(sizes(gaussians)[seen][inner].median())
+
+
+def sizes(gaussians: Gaussians) -> Tensor:
+    """The size of each splat, [N] in world units: the geometric mean of its two longer axes (standard deviations)."""
+    return gaussians.scales.topk(2, dim=1).values.prod(dim=1).sqrt()
 
 
 def guess_up(means: Tensor) -> tuple[float, float, float] | None:

@@ -30,7 +30,7 @@ def make_report(scene: TiledScene, files: Sequence[Path], seconds: dict[str, flo
         base=scene.digest,
         inputs=scene.wrapped.asked,
         cameras_from=scene.wrapped.cameras_from,
-        orbit=scene.orbit,
+        orbit=scene.viewpoints.orbit,
         settings=config,
         backend=scene.backend_note,
         views=f"{scene.views.note}, in {len(files)} tiles",

@@ -16,7 +16,8 @@ from mipmap_plugin.adaptation.optimization.amount import affordable_for
 from mipmap_plugin.adaptation.optimization.validation import split_validation
 from mipmap_plugin.adaptation.seeing import seeing
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views import choose_views, orbit_of, orbited
+from mipmap_plugin.adaptation.viewpoints import Viewpoints, orbit_of
+from mipmap_plugin.adaptation.views import choose_views, orbited
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.camera import Camera
@@ -30,7 +31,6 @@ from mipmap_plugin.models.inria_folder import read_options, trained_scale
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.scenes.orbits import Orbit
 from mipmap_plugin.tiles.cut import Tree
 from mipmap_plugin.tiles.folder import BASE, CUT
 from mipmap_plugin.tiles.reading import find_splats
@@ -100,18 +100,19 @@ class TiledScene:
         return self.wrapped.effects()
 
     @cached_property
-    def orbit(self) -> Orbit:
-        """What views without cameras go around: all splats."""
-        return orbit_of(self.wrapped.model, self.wrapped.trained.up, self.base.places[:, :3])
+    def viewpoints(self) -> Viewpoints:
+        """Where views without cameras are: around all splats. Each counts as clear, for nothing here draws the whole scene to look."""
+        orbit = orbit_of(self.wrapped.model, self.wrapped.trained.up, self.base.places[:, :3])
+        return Viewpoints(orbit, list)
 
     @cached_property
     def views(self) -> Views:
-        """The views of the whole scene, as without tiles; how near those of a capture without cameras are is told by a sample of its splats."""
-        cameras, orbit = seeing(self.wrapped.cameras, self.base.places[:, :3], self.target.near_plane), self.orbit
+        """The views of the whole scene, as without tiles but for captures without cameras: a sample of their splats tells how near views are."""
+        cameras = seeing(self.wrapped.cameras, self.base.places[:, :3], self.target.near_plane)
         if not cameras and self.config.views != "orbit":
-            warnings.warn(orbited(self.checkpoint.path, orbit), stacklevel=1)
-        chosen, note = choose_views(cameras, orbit, self.config)
-        adapted, validation = split_validation(cameras, chosen, orbit, self.scale, self.config)
+            warnings.warn(orbited(self.checkpoint.path, self.viewpoints.orbit), stacklevel=1)
+        chosen, note = choose_views(cameras, self.viewpoints, self.config)
+        adapted, validation = split_validation(cameras, chosen, self.viewpoints, self.scale, self.config)
         note += f", {len(chosen) - len(adapted)} of them kept for validation" if len(adapted) < len(chosen) else ""
         named = [replace(view, name=str(number)) for number, view in enumerate([*adapted, *validation])]
         judged = named[len(adapted) :]

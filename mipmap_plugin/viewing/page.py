@@ -101,11 +101,14 @@ class Page:
         server.gui.set_panel_label(settings.title)
         server.gui.main_panel.dock_right()  # beside the picture, not on it
         viewers = [viewer or AS_TRAINED for viewer in settings.viewers]
-        views = list(self._views.values())
-        view = views[0 if self._stage.base.cameras else len(views) // 2]  # an orbit begins high above
+        base, views = self._stage.base, list(self._views.values())
+        view = views[0]
+        if not base.cameras:  # an orbit begins high above, and a capture's with views through its walls
+            best = base.viewpoints.best(views)
+            view = best[len(best) // 2]
         first, moment = self._pose(view), view.time or 0.0 if self._stage.base.model.traits.moves else None
         self._controls = Controls(server.gui, self._names(), viewers, list(self._views), settings.recipes, moment)
-        vertical = None if self._stage.base.cameras else self._stage.base.orbit().up
+        vertical = None if base.cameras else base.viewpoints.orbit.up
         server.scene.set_up_direction(vertical or up_of(views))
         camera = server.initial_camera
         camera.position, camera.look_at, camera.fov = first.position, first.look_at, first.fov

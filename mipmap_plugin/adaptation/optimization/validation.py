@@ -21,13 +21,13 @@ from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.adaptation.parallel import max_threads, together
 from mipmap_plugin.adaptation.renderers import Renderer
 from mipmap_plugin.adaptation.target.resize import difference_from
+from mipmap_plugin.adaptation.viewpoints import Viewpoints
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.process.threads import side_by_side
-from mipmap_plugin.scenes.orbits import Orbit
 from mipmap_plugin.scenes.trajectories import jittered, with_company
 
 # At most one in this many of the given cameras is kept for validation, where the policy leaves the choice of views to us.
@@ -174,17 +174,17 @@ def no_validation(truth: Callable[[Camera], Tensor], render: Callable[[Gaussians
 
 
 def split_validation(
-    cameras: Sequence[Camera], views: Sequence[Camera], orbit: Orbit, scale: float, config: AdaptConfig
+    cameras: Sequence[Camera], views: Sequence[Camera], viewpoints: Viewpoints, scale: float, config: AdaptConfig
 ) -> tuple[list[Camera], list[Camera]]:
     """Return the views to adapt to, out of `views`, and the views for validation.
 
     For validation: some of the given cameras, where a policy chooses among enough of them, and random views from the region that they
     span; without cameras, the views of another orbit. Of large images only the middle is used; there are no validation views if one
-    pixel of the base is larger than that. `orbit`: as of `choose_views`.
+    pixel of the base is larger than that. `viewpoints`: as of `choose_views`.
     """
     if scale > WINDOW:
         return list(views), []
-    adapted, validation = _validation_views(cameras, views, orbit, config)
+    adapted, validation = _validation_views(cameras, views, viewpoints, config)
     size = round(WINDOW / max(1.0, scale))
     return adapted, [view.window(size, size) for view in validation]
 
@@ -196,21 +196,21 @@ def count_of_views(config: AdaptConfig) -> int:
 
 
 def _validation_views(
-    cameras: Sequence[Camera], views: Sequence[Camera], orbit: Orbit, config: AdaptConfig
+    cameras: Sequence[Camera], views: Sequence[Camera], viewpoints: Viewpoints, config: AdaptConfig
 ) -> tuple[list[Camera], list[Camera]]:
     """`split_validation` with whole images. Random views come first in each pair, so that they steer and kept cameras choose."""
     count = count_of_views(config)
     generator = torch.Generator().manual_seed(config.seed + SEED_OFFSET)
     if config.views == "orbit" or not cameras:
         changes = {"views": "orbit", "extra_views": count, "seed": config.seed + SEED_OFFSET}
-        validation, _ = choose_views(cameras, orbit, config.model_copy(update=changes))
+        validation, _ = choose_views(cameras, viewpoints, config.model_copy(update=changes))
         return list(views), validation
     originals = [view for view in views if view in set(cameras)]
     kept: list[Camera] = []
     if config.views in ("train", "jittered"):
         kept = evenly(originals[VALIDATION_EVERY // 2 :], min(count // 2, len(originals) // VALIDATION_EVERY))
     adapted = [view for view in views if view not in set(kept)]
-    known = with_company(originals or list(views), orbit)
+    known = with_company(originals or list(views), viewpoints.orbit)
     random = jittered(known, count - len(kept), generator, spread=False)
     return adapted, [view for pair in zip(random, kept, strict=False) for view in pair] + random[len(kept) :]
 

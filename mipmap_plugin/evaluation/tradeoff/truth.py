@@ -87,7 +87,7 @@ def base_itself(model: Wrapped, scale: float, most: int | None, views: Sequence[
 def unseen(model: Wrapped, adapted_to: Sequence[Camera]) -> list[Camera]:
     """Views that nothing was adapted to: the cameras that are not among those `adapted_to` or, if all are, a generated one."""
     generator = torch.Generator().manual_seed(EVALUATION_SEED)
-    views = _others(model.cameras, adapted_to) or jittered(with_company(model.views(), model.orbit()), 1, generator)
+    views = _others(model.cameras, adapted_to) or jittered(with_company(model.views(), model.viewpoints.orbit), 1, generator)
     return with_times(views, EVALUATION_SEED)[0] if model.model.traits.moves else views
 
 
@@ -96,13 +96,13 @@ def _held_out(model: Wrapped) -> tuple[list[Camera], list[Camera]]:
     generator = torch.Generator().manual_seed(EVALUATION_SEED)
     test, train = ([camera for camera in model.cameras if camera.split == split] for split in ("test", "train"))
     if not model.cameras:
-        judged = choose_views([], model.orbit(), AdaptConfig(seed=EVALUATION_SEED, extra_views=HELD_OUT_EVERY))[0]
+        judged = choose_views([], model.viewpoints, AdaptConfig(seed=EVALUATION_SEED, extra_views=HELD_OUT_EVERY))[0]
     elif test and (rest := _others(train, test)):
         judged, train = test, rest
     elif rest := _others(model.cameras, model.cameras[::HELD_OUT_EVERY]):
         judged, train = model.cameras[::HELD_OUT_EVERY], rest
     else:
-        judged, train = jittered(with_company(model.cameras, model.orbit()), HELD_OUT_EVERY, generator), model.cameras
+        judged, train = jittered(with_company(model.cameras, model.viewpoints.orbit), HELD_OUT_EVERY, generator), model.cameras
     return (with_times(judged, EVALUATION_SEED)[0] if model.model.traits.moves else judged), train
 
 

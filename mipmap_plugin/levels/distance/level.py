@@ -73,11 +73,11 @@ class LevelRun:
     seconds: dict[str, float] = field(default_factory=lambda: {"optimization": 0.0})
 
     def __post_init__(self) -> None:
-        scene, self.config, orbit = self.scene, self.scene.config(self.number), self.scene.base.orbit()
+        scene, self.config, viewpoints = self.scene, self.scene.config(self.number), self.scene.base.viewpoints
         self.size = scene.rule.middle(self.number)
         cameras = scene.views if scene.base.cameras else []
-        chosen, note = choose_views(cameras, orbit, self.config)
-        views, held_out = split_validation(cameras, evenly(chosen, _most_views(self.config)), orbit, 1.0, self.config)
+        chosen, note = choose_views(cameras, viewpoints, self.config)
+        views, held_out = split_validation(cameras, evenly(chosen, _most_views(self.config)), viewpoints, 1.0, self.config)
         begins: dict[Camera, Camera] = {}
 
         def walked(starts: Sequence[Camera]) -> list[Camera]:
@@ -211,7 +211,7 @@ class LevelRun:
             versions=versions(),
             inputs=scene.base.asked,
             cameras_from=scene.base.cameras_from,
-            orbit=scene.base.orbit(),
+            orbit=scene.base.viewpoints.orbit,
             notes=[*doubts_in(scene.base.model.notes), *self._worse(best, psnrs)],
         )
 

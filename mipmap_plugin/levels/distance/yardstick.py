@@ -62,7 +62,7 @@ class Walks:
 
     def __init__(self, scene: Scene, levels: Sequence[SplatModel]) -> None:
         generator = torch.Generator().manual_seed(derived_seed(int(scene.request.settings.get("seed", 0)), DRAW))
-        around = with_company(scene.views, scene.base.orbit())
+        around = with_company(scene.views, scene.base.viewpoints.orbit)
         seeing = [view for view in (*jittered(around, VIEWS, generator), *scene.views) if math.isfinite(self._depth(view, scene))]
         self.views = seeing[:VIEWS]
         self._truth = WalkTruth((scene.splats, scene.backend, scene.base.effects()), scene.views, {}, SAMPLES)

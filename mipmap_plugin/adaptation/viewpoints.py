@@ -1,0 +1,108 @@
+"""Where a scene that came without cameras is looked at from: an orbit, and of a capture those of its views that see it clearly."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.adaptation.parallel import max_threads
+from mipmap_plugin.backends.base import Backend
+from mipmap_plugin.camera import ONE_PIXEL, Camera, evenly
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.adapted_scale import adapted_orbit
+from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.process.threads import side_by_side
+from mipmap_plugin.scenes.orbits import Orbit, sharp_size, sizes
+from mipmap_plugin.splatting.harmonics import C0
+
+# A view stands in fog, or behind a wall, if more than half of what it shows are splats larger (`sizes`) than FOG of its shorter side. Half of what
+# photographs show are splats of 0.02 to 0.07 in two captures, of such views 0.1 to 4; limits of 0.05 and 0.2 choose as well.
+FOG = 0.1
+
+# px: the shorter side of the pictures that tell.
+LOOK = 64
+
+# Times as many views as are wanted are tried at most. Of a kitchen that was photographed from one side a quarter are clear.
+ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class Viewpoints:
+    """Of a scene without cameras: what views go around, and which of them see it clearly."""
+
+    orbit: Orbit
+    clear: Callable[[Sequence[Camera]], list[Camera]]  # those of the views that see it clearly (`ClearViews`)
+
+    def views(self, size: tuple[int, int], count: int, generator: torch.Generator) -> list[Camera]:
+        """`count` views of `size` (height, width) px. Of a capture they are clear; fewer where fewer are, and any where none is."""
+        first = self.orbit.views(size, count, generator)
+        found = self.clear(first) if self.orbit.nearest else first
+        for number in range(1, ROUNDS):
+            if len(found) < count:
+                found += evenly(self.clear(self.orbit.views(size, count, generator, number * count)), count - len(found))
+        return found or first
+
+    def best(self, views: Sequence[Camera]) -> list[Camera]:
+        """Those of the orbit's views that see a capture clearly, or all if none does."""
+        return (self.clear(views) if self.orbit.nearest else []) or list(views)
+
+
+class ClearViews:
+    """Finds the views that see a model clearly. Each is looked at once."""
+
+    def __init__(self, model: SplatModel, backend: Callable[[], Backend], effects: Effects) -> None:
+        """`backend`: of what draws the model; `effects`: how the model is rendered at its own scale."""
+        self._model, self._backend = model, backend
+        settings = effects.settings.without_color_rounding()
+        self._effects = replace(effects, sh_degree=0, background=(0.0, 0.0, 0.0), settings=settings)
+        self._known: dict[tuple[bytes, tuple[int, int], float], bool] = {}
+
+    @torch.no_grad()
+    def __call__(self, views: Sequence[Camera]) -> list[Camera]:
+        """Those of the views that see the model clearly. All of a model whose splats have covariances instead of scales."""
+        unknown = [view for view in views if _key(view) not in self._known]
+        if unknown:
+            small, backend = [view.zoomed(LOOK / min(view.size)) for view in unknown], self._backend()
+            once = self._model.gaussians(unknown[0]) if self._model.traits.same_for_all_views else None
+            threads = max_threads(self._model.parameters()["means"], small[0])
+            shown = side_by_side(lambda view: self._is_clear(view, backend, once), small, threads)
+            self._known.update(zip(map(_key, unknown), shown, strict=True))
+        return [view for view in views if self._known[_key(view)]]
+
+    def _is_clear(self, view: Camera, backend: Backend, once: Gaussians | None) -> bool:
+        splats = self._model.gaussians(view) if once is None else once
+        if splats.covariances is not None:
+            return True
+        depth = view.to_camera(splats.means)[:, 2]
+        large = (sizes(splats) * view.fx > FOG * min(view.size) * depth).to(splats.means)
+        colors = torch.stack([large, torch.ones_like(large), large], dim=1)  # an image is linear in them: its sums are those of blend weights
+        drawn = backend.render(replace(splats, sh=((colors - 0.5) / C0)[:, None]), view, self._effects).image
+        fog, all_of_it, _ = drawn.sum((0, 1)).tolist()
+        return bool(all_of_it > 0 and fog <= all_of_it / 2)
+
+
+def _key(view: Camera) -> tuple[bytes, tuple[int, int], float]:
+    return view.viewmat.numpy().tobytes(), view.size, view.fx
+
+
+def orbit_of(model: SplatModel, up: tuple[float, float, float] | None, means: Tensor | None = None) -> Orbit:
+    """What an orbit around a model goes around. That of an adapted file is its base's, so that both are seen from the same places.
+
+    `up`: the vertical, as the user or the base's files say (`wrap.Wrapped.trained`); None: they do not. `means` [N, 3]: of all splats,
+    where the model has but some of its file.
+    """
+    recorded = adapted_orbit(model.source)
+    if recorded is None:
+
+        def size() -> float:
+            return sharp_size(model.gaussians(ONE_PIXEL)) if model.traits.same_for_all_views else math.inf
+
+        orbit = Orbit.around(model.parameters()["means"] if means is None else means, sharp=size)
+    else:
+        orbit = Orbit(**recorded)
+    return orbit if up is None else replace(orbit, up=up, said=True)

@@ -1,0 +1,85 @@
+"""From where a scene without cameras is looked at: of a capture by those views of its orbit that see it clearly."""
+
+from dataclasses import replace
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin import wrap_model
+from mipmap_plugin.adaptation.viewpoints import FOG, ROUNDS, ClearViews, Viewpoints
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.scenes.orbits import Orbit
+
+CAPTURE, OBJECT = Orbit((0.0, 0.0, 0.0), (0.0, -1.0, 0.0), 8.0, nearest=4.0), Orbit((0.0, 0.0, 0.0), None, 8.0)
+COUNT = 12
+
+
+def views_of(orbit, clear, count=COUNT):
+    return Viewpoints(orbit, lambda views: [view for view in views if clear(view)]).views((32, 32), count, torch.Generator().manual_seed(0))
+
+
+def on_one_side(view):
+    return float(view.center[0]) > 0
+
+
+def test_views_of_a_capture_are_clear_and_as_many_as_are_wanted():
+    views = views_of(CAPTURE, on_one_side)
+    assert len(views) == COUNT and all(map(on_one_side, views))
+    assert len({view.name for view in views}) == COUNT
+
+
+def test_where_few_are_clear_there_are_few_and_where_none_is_there_are_all():
+    tried = []
+    [found] = views_of(CAPTURE, lambda view: tried.append(view.name) or view.name == f"orbit_{2 * COUNT:04d}")
+    assert found.name in tried and len(set(tried)) == ROUNDS * COUNT
+    assert len(views_of(CAPTURE, lambda view: False)) == COUNT
+
+
+def test_an_object_is_looked_at_from_all_around():
+    assert len(views_of(OBJECT, lambda view: False)) == COUNT
+
+
+def scene(*, floater):
+    """A square of 400 small splats at z = 0, and a large one at z = -2."""
+    places = torch.linspace(-1, 1, 20)
+    square = torch.stack([*torch.meshgrid(places, places, indexing="ij"), torch.zeros(20, 20)], dim=-1).reshape(-1, 3)
+    splats = tiny.gaussians(401)
+    means, scales = torch.cat([square, torch.tensor([[0.0, 0.0, -2.0]])]), torch.full((401, 3), 0.04)
+    scales[-1] = floater
+    return replace(splats, means=means, scales=scales, opacities=torch.full((401,), 0.95))
+
+
+def looking(z: float) -> Camera:
+    """From (0, 0, z) at the square; z < 0 along +z."""
+    turn = torch.diag(torch.tensor([1.0, 1.0, 1.0] if z < 0 else [-1.0, 1.0, -1.0]))
+    viewmat = torch.eye(4)
+    viewmat[:3, :3], viewmat[2, 3] = turn, abs(z)
+    return Camera(200, 200, 200.0, 200.0, 100.0, 100.0, viewmat, f"from {z:g}")
+
+
+def clear_views(splats, views):
+    wrapped = wrap_model(VanillaModel.from_gaussians(splats), backend="reference")
+    return [view.name for view in wrapped.viewpoints.clear(views)]
+
+
+@pytest.mark.parametrize(("floater", "seen"), [(1.0, ["from 4"]), (0.04, ["from -4", "from 4"])])
+def test_a_view_through_a_large_splat_is_not_clear_and_what_is_behind_the_scene_does_not_count(floater, seen):
+    assert clear_views(scene(floater=floater), [looking(-4.0), looking(4.0)]) == seen
+
+
+def test_how_large_a_splat_may_look_is_a_share_of_the_picture():
+    near, far = (clear_views(scene(floater=0.04), [looking(-z)]) for z in (2.3, 0.9 * 0.04 / FOG))
+    assert near and not far  # from where the square's splats are larger than that
+
+
+def test_a_view_of_nothing_is_not_clear():
+    away = replace(looking(-4.0), viewmat=torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ looking(-4.0).viewmat.float())
+    assert clear_views(scene(floater=0.04), [away]) == []
+
+
+def test_each_view_is_looked_at_once():
+    wrapped, asked = wrap_model(VanillaModel.from_gaussians(scene(floater=0.04)), backend="reference"), []
+    clear = ClearViews(wrapped.model, lambda: asked.append(1) or wrapped.backend()[0], wrapped.effects())
+    assert len(clear([looking(-4.0)])) == len(clear([looking(-4.0)])) == len(asked) == 1
