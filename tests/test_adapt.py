@@ -656,7 +656,7 @@ def test_a_scene_nearer_than_the_near_plane_is_refused_with_what_to_do():
     small = VanillaModel.from_gaussians(replace(splats, means=splats.means * 0.01, scales=splats.scales * 0.01))
     smaller = torch.diag(torch.tensor([0.01, 0.01, 0.01, 1.0], dtype=torch.float64))
     views = [view.moved(smaller) for view in tiny.cameras(2)]
-    with pytest.raises(SettingsError, match=r"all splats lie nearer than 0.2 units, .* scale the scene and its cameras up"):
+    with pytest.raises(SettingsError, match=r"all splats lie nearer than 0.2 units, .* scale the scene up, with its cameras if it has any"):
         wrap_model(small, cameras=views).adapt(0.5, steps=0, views="given")
 
 
@@ -668,7 +668,8 @@ def shrunk(factor):
 
 def test_a_scene_in_small_units_is_told_of_where_the_near_plane_keeps_an_orbit_away_from_it():
     base = wrap_model(shrunk(0.02))
-    where = r"the scene is 0.0\d+ units wide, and no view shows it larger than \S+ px: renderers of 3DGS draw nothing nearer than 0.2 units; scale"
+    where = r"the scene is 0.0\d+ units wide, and no view shows it larger than \S+ px: renderers of 3DGS draw nothing nearer than 0.2 units; "
+    where += "scale the scene up, with its cameras if it has any"  # here it has none
     [remark] = remarks(base.views(), base.model, 0.2, orbit=True)
     assert re.match(where, remark) and not remarks(base.views(), base.model, 0.2, orbit=False)
     with pytest.raises(SettingsError, match=r"renderers of 3DGS draw nothing nearer than 0\.2 units"):
