@@ -37,7 +37,7 @@ lego_400 and those after it were trained by gsplat in 7,000 steps, on the 100 tr
 3DGS, with gsplat's `antialiased`, and as Mip-Splatting. Their seconds are of a machine that was busy and half as fast. Not by this command:
 
 - lego_400_P1: `mipmap-plugin evaluate lego_400 --images lego --protocol P1 --scale 1/2 --scale 1/4 --scale 1/8 --recipe default`.
-- lego_400_P1_area: the same at x1/4 and x1/8 by `mipmap_plugin.evaluation.evaluate.evaluate(..., resize="area")`: adapted to box averages.
+- lego_400_P1_area: the same at x1/4 and x1/8 with `--resize area`: adapted to box averages.
 - bird_544: the same command by P3 and with `--recipe instant`, of a phone's capture that was trained on 161 photographs, judged on the 23 others.
 """
 RECIPES: tuple[str, ...] = ("instant", "paper", "default")

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, unknown
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import USUAL, RenderSettings
 from mipmap_plugin.screen_filters import COMPENSATED, DILATION, INTEGRATED
@@ -55,8 +55,8 @@ class Effects:
     exposure: bool = False
 
     def __post_init__(self) -> None:
-        if unknown := [name for name in self.outputs if name not in list(OUTPUTS)]:
-            raise SettingsError(f"there is no output {unknown[0]!r}; choose from {', '.join(OUTPUTS)}")
+        if wrong := [name for name in self.outputs if name not in list(OUTPUTS)]:
+            raise SettingsError(unknown("output", str(wrong[0]), [*OUTPUTS]))
         if len(self.background) != 3 or not all(map(math.isfinite, self.background)):
             raise SettingsError(f"background must be three finite numbers, got {self.background!r}")
         if not 0 <= self.eps2d < math.inf or self.sh_degree < 0 or self.supersampling < 1:

@@ -18,6 +18,7 @@ import pytest
 import tiny
 import torch
 
+from mipmap_plugin.adaptation.optimization import loop
 from mipmap_plugin.adaptation.optimization.budget import Pace
 from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.interrupt import interruptible
@@ -195,6 +196,22 @@ def test_a_resumed_default_run_equals_an_uninterrupted_one(tmp_path, ctrl_c, nth
     files = [adapted.save(tmp_path / f"{i}.ply").read_bytes() for i, adapted in enumerate((whole, resumed))]
     assert files[0] == files[1] and not state.exists()
     assert [(p.step, p.psnr_db, p.gaussians) for p in resumed.report.curve] == [(p.step, p.psnr_db, p.gaussians) for p in whole.report.curve]
+
+
+def test_a_second_ctrl_c_ends_a_step_without_saving(tmp_path, monkeypatch):
+    pressing.in_step(monkeypatch, lambda: [signal.raise_signal(signal.SIGINT) for _ in range(2)])(3)
+    with pytest.raises(KeyboardInterrupt) as ended:
+        wrapped().adapt(1 / 4, resume=tmp_path / "run.resume", **BRIEF)
+    assert not isinstance(ended.value, Interrupted) and not (tmp_path / "run.resume").exists()
+
+
+def test_ctrl_c_after_the_last_step_is_heard(tmp_path, monkeypatch):
+    whole, undo = wrapped().adapt(1 / 4, **BRIEF), loop.undo_harmful_growth
+    with monkeypatch.context() as pressed:
+        pressed.setattr(loop, "undo_harmful_growth", lambda *run: (signal.raise_signal(signal.SIGINT), undo(*run)))
+        with pytest.raises(Interrupted, match=f"interrupted at step {BRIEF['steps']}; run the same command again"):
+            wrapped().adapt(1 / 4, resume=tmp_path / "run.resume", **BRIEF)
+    assert torch.equal(shown(wrapped().adapt(1 / 4, resume=tmp_path / "run.resume", **BRIEF)), shown(whole))
 
 
 def test_an_observer_may_interrupt_a_run(tmp_path):
@@ -656,7 +673,7 @@ def test_a_scene_nearer_than_the_near_plane_is_refused_with_what_to_do():
     small = VanillaModel.from_gaussians(replace(splats, means=splats.means * 0.01, scales=splats.scales * 0.01))
     smaller = torch.diag(torch.tensor([0.01, 0.01, 0.01, 1.0], dtype=torch.float64))
     views = [view.moved(smaller) for view in tiny.cameras(2)]
-    with pytest.raises(SettingsError, match=r"all splats lie nearer than 0.2 units, .* scale the scene and its cameras up"):
+    with pytest.raises(SettingsError, match=r"all splats lie nearer than 0.2 units, .* scale the scene up, with its cameras if it has any"):
         wrap_model(small, cameras=views).adapt(0.5, steps=0, views="given")
 
 
@@ -668,7 +685,8 @@ def shrunk(factor):
 
 def test_a_scene_in_small_units_is_told_of_where_the_near_plane_keeps_an_orbit_away_from_it():
     base = wrap_model(shrunk(0.02))
-    where = r"the scene is 0.0\d+ units wide, and no view shows it larger than \S+ px: renderers of 3DGS draw nothing nearer than 0.2 units; scale"
+    where = r"the scene is 0.0\d+ units wide, and no view shows it larger than \S+ px: renderers of 3DGS draw nothing nearer than 0.2 units; "
+    where += "scale the scene up, with its cameras if it has any"  # here it has none
     [remark] = remarks(base.views(), base.model, 0.2, orbit=True)
     assert re.match(where, remark) and not remarks(base.views(), base.model, 0.2, orbit=False)
     with pytest.raises(SettingsError, match=r"renderers of 3DGS draw nothing nearer than 0\.2 units"):

@@ -1,6 +1,7 @@
 """A run with a time budget has as many steps and views as fit into it."""
 
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import pytest
@@ -15,7 +16,7 @@ from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.run import Run, Task
-from mipmap_plugin.adaptation.optimization.validation import Steering, no_validation
+from mipmap_plugin.adaptation.optimization.validation import Steering, Validation, no_validation
 from mipmap_plugin.recipes import recipe
 
 STILL = Following()
@@ -146,3 +147,29 @@ def test_the_pace_is_measured_in_images_and_truths(monkeypatch):
     pace = Pace.of(tiny.model(5), task)
     assert pace.a_view == pytest.approx(budget.STEP_OVER_IMAGE * 0.1)
     assert (pace.a_truth, pace.a_check) == (0.5, 0.0)
+
+
+def test_validation_is_measured_as_it_is_done_in_the_middle_of_large_views_and_in_all_viewers(monkeypatch):
+    monkeypatch.undo()
+    seen = []
+
+    def draw(splats, camera):
+        seen.append(camera.size)
+        return torch.zeros(camera.height, camera.width, 3)
+
+    def seconds(function, camera, device):
+        began = len(seen)
+        function(camera)
+        return sum(width * height for width, height in seen[began:])
+
+    monkeypatch.setattr(budget, "_seconds", seconds)
+    whole = [camera.resized(40, 30) for camera in tiny.cameras(7)]
+    steering, choosing = ([view.window(8, 8) for view in some] for some in (whole[2:4], whole[4:]))
+    truth = cache(lambda view: draw(None, view))
+    for view in steering:  # which were used to choose the start
+        truth(view)
+    validation = Validation(steering, choosing, 1.0, truth, draw, "area", [draw])
+    pace = Pace.of(tiny.model(5), replace(a_task(2), views=whole[:2], scale=1.0, render=draw, validation=validation))
+    assert pace.a_view == budget.STEP_OVER_IMAGE * 40 * 30
+    assert pace.a_check == 2 * 2 * 64
+    assert pace.a_choice == 3 * 64 * (1 + 2 * budget.STATES)  # the truth, and each state in two viewers

@@ -31,6 +31,7 @@ from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.splatting.harmonics import basis
 from mipmap_plugin.splatting.projection import axes_of
+from mipmap_plugin.wrap import wrap_model
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
@@ -477,13 +478,17 @@ def test_the_gltf_of_splat_transform_is_its_ply(shared_data, tmp_path):
     torch.testing.assert_close(axes_of(read.quats, read.scales).abs(), axes_of(plain.quats, plain.scales).abs(), atol=1e-6, rtol=1e-4)
 
 
-@pytest.mark.usefixtures("small_orbits")
-def test_the_db_of_a_file_are_of_what_its_format_keeps(tool, tmp_path, capsys):
+@pytest.fixture
+def rounding(tool):
     """The stand-in writes SPZ that it reads as `answer.ply`, another model: as if the format rounded a lot."""
     script = (tool / "splat-transform").read_text()
     (tool / "splat-transform").write_text(script + f"pathlib.Path(target).write_bytes({gzip.compress(SPZ)!r}) if target.endswith('.spz') else None\n")
-    words = ["--scale", "1/4", "--steps", "0", "--viewer", "classic"]
     tiny.model(seed=5).save(tool / "answer.ply", provenance={}, overwrite=True)
+
+
+@pytest.mark.usefixtures("small_orbits", "rounding")
+def test_the_db_of_a_file_are_of_what_its_format_keeps(tmp_path, capsys):
+    words = ["--scale", "1/4", "--steps", "0", "--viewer", "classic"]
     source = tiny.ply(tmp_path / "scan.ply")
     assert main(["adapt", str(source), *words, "--output", str(tmp_path / "scan.spz"), "--report"]) == 0
     said = capsys.readouterr()
@@ -497,6 +502,14 @@ def test_the_db_of_a_file_are_of_what_its_format_keeps(tool, tmp_path, capsys):
     assert picture["mean"] == {"psnr_db": report["written"]} and picture["view"]["psnr_db"] < exact - 1
     assert f"→ {report['written']:.1f} dB on views" in record["lead"] and record["adaptations"][0]["written"] == report["written"]
     assert "its format rounds splats, which costs" in said.err and any("its format rounds splats" in note for note in report["notes"])
+
+
+@pytest.mark.usefixtures("small_orbits", "rounding")
+def test_the_db_in_each_of_several_viewers_are_of_what_a_format_keeps(tmp_path):
+    adapted = wrap_model(tiny.ply(tmp_path / "scan.ply")).adapt(1 / 4, steps=0, merge_to=1.0, viewer="portable")
+    exact, files = adapted.report.viewers, [adapted.save(tmp_path / f"a.{suffix}") for suffix in ("ply", "spz")]
+    ply, spz = (json.loads(file.with_name(f"{file.name}.adaptation.json").read_text())["viewers"] for file in files)
+    assert ply == exact and spz.keys() == exact.keys() and spz["classic"] < exact["classic"] - 1
 
 
 @pytest.mark.usefixtures("small_orbits")

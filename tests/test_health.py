@@ -67,6 +67,15 @@ def test_a_file_most_of_which_shows_nothing_is_told_in_the_verdict(tmp_path, cap
     assert (f"verdict:      sound, but {told}; next: " in capsys.readouterr().out) == bool(told)
 
 
+@pytest.mark.parametrize(("most", "told"), [(0.01, True), (0.03, False), (0.003, False)])  # the last: all are invisible, which is told instead
+def test_a_scene_as_faint_as_after_a_reset_of_opacities_is_told_of(most, told):
+    model = healthy()
+    model.parameters()["opacities"].clamp_(max=math.log(most / (1 - most)))
+    health = examine(model)
+    assert any(each.startswith("200 of 200 splats have an opacity below 2 %") for each in health.sentences()) == told
+    assert health.spoilt() == (most < 1 / 255)  # it may be meant so
+
+
 def test_surfels_have_no_third_axis_and_are_no_sheets_for_it():
     surfels = healthy()
     surfels.parameters()["scales"][:, 2] = -30.0

@@ -672,6 +672,12 @@ def test_a_new_viewer_is_one_record():
         find_viewer("wrong")
 
 
+@pytest.mark.parametrize(("name", "guess"), [("antialised", "; did you mean antialiased"), (None, "$")])
+def test_a_screen_filter_that_there_is_not_is_told_with_what_was_probably_meant(name, guess):
+    with pytest.raises(SettingsError, match=f"viewer 'a': there is no screen filter '{name}'; choose from classic, .*, window{guess}"):
+        Viewer("a", "A", "nowhere", name, 2.0)
+
+
 def test_a_viewer_draws_no_more_bands_than_it_has():
     effects = find_viewer("gaussian-splats-3d").effects(Effects(3, background=(1.0, 1.0, 1.0), near_plane=0.5))
     assert (effects.sh_degree, effects.background, effects.near_plane) == (0, (1.0, 1.0, 1.0), 0.5)

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from mipmap_plugin.adaptation import notebook
+from mipmap_plugin.adaptation.in_viewers import psnr_per_viewer
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, Validation
 from mipmap_plugin.adaptation.report import Report
@@ -50,7 +51,7 @@ class Adapted:
         adapted_to: The cameras of the base scale that the model was adapted to or selected on.
         cameras: The base's, at its scale.
         judge: The views that nothing was adapted to, with their truth, to measure a file whose format rounds splats; None where there are none.
-        written: dB of such files on those views, once they are saved.
+        written: What the reports of such files say of those views, once they are saved: dB, and dB in each of several viewers.
     """
 
     model: SplatModel
@@ -62,7 +63,7 @@ class Adapted:
     adapted_to: Sequence[Camera] = ()
     cameras: Sequence[Camera] = ()
     judge: Validation | None = None
-    written: dict[Path, float] = field(default_factory=dict)
+    written: dict[Path, dict[str, Any]] = field(default_factory=dict)
 
     @usual_modes()
     def render(self, camera: Camera, *, outputs: Sequence[str] | None = (), exposure: bool = False, viewer: str | None = None) -> Rendered:
@@ -113,7 +114,9 @@ class Adapted:
         if self.judge is None or not is_written(saved):
             return
         with announced(f"measuring {saved.name}"):
-            self.written[saved] = min(self.judge.viewer_psnrs(self._read(staged(saved)), self.judge.choosing))
+            model = self._read(staged(saved))
+            psnr = min(self.judge.viewer_psnrs(model, self.judge.choosing))
+            self.written[saved] = {"written": psnr, "viewers": psnr_per_viewer(self.judge, self.backend, self.viewers, model)}
 
     def as_written(self, path: Path) -> Adapted:
         """This with the splats and the report of the file at `path`, whose format may round them."""
@@ -130,12 +133,12 @@ class Adapted:
         lost = filter(None, (left_out, self._rounded(path), self._drawn_otherwise(path)))
         moved = self.model.traits.placed and (path.suffix.lower() == ".ply" or is_written(path))  # which does not say where the cameras go
         cameras_from = {} if moved else self.report.cameras_from
-        changes = {"notes": [*self.report.notes, *lost], "cameras_from": cameras_from, "written": self.written.get(path)}
-        return self.report.model_copy(update=changes)
+        changes = {"notes": [*self.report.notes, *lost], "cameras_from": cameras_from, "written": None}
+        return self.report.model_copy(update=changes | self.written.get(path, {}))
 
     def _rounded(self, path: Path) -> str:
         """What the rounding of its format costs the file at `path`, in a sentence; "" where that is hardly anything, or was not measured."""
-        exact, written = self.report.psnr_after(), self.written.get(path)
+        exact, written = self.report.psnr_after(), self.written.get(path, {}).get("written")
         if exact is None or written is None or written >= exact - HARM_DB:
             return ""
         return f"{path.name}: its format rounds splats, which costs {exact - written:.2f} dB on views that nothing was adapted to; a .ply keeps them"

@@ -40,6 +40,9 @@ LOOKED_AT, TOO_MANY = 16, 0.05
 # it, unless the near plane keeps it away from a scene in small units; then pictures are of another zoom than a user looks from.
 LEAST_PIXELS, LEAST_SHARE = 16, 0.25
 
+# What to do about a scene in units so small that the near plane hides it.
+SCALE_UP = "scale the scene up, with its cameras if it has any"
+
 # What is said where there are no cameras: with those of an object all is well, but those of a capture are a guess, which may cost 10 dB and more.
 ORBITED = (
     "no cameras are known: views of a generated orbit are adapted to, {told}, and all dB are of such{seems}; "
@@ -188,7 +191,7 @@ def refuse_blind(views: Sequence[Camera], model: SplatModel, near: float, image_
         if showing(some, means, near):
             wrong = "all splats in view have an opacity below 1/255 and are never drawn; the training or the export failed"
         elif showing(some, means, 0.0):
-            wrong = f"all splats lie nearer than {near:g} units, where renderers of 3DGS draw none; scale the scene and its cameras up"
+            wrong = f"all splats lie nearer than {near:g} units, where renderers of 3DGS draw none; {SCALE_UP}"
         raise SettingsError(f"none of the {len(views)} views shows a splat: {wrong}")
 
 
@@ -218,7 +221,7 @@ def too_near(views: Sequence[Camera], means: Tensor, near: float) -> str:
     if not lost or fmean(lost) <= TOO_MANY:
         return ""
     where = f"{fmean(lost):.0%} of the splats in a view's picture lie nearer than {near:g} units"
-    return f"{where}, where renderers of 3DGS draw none; scale the scene and its cameras up"
+    return f"{where}, where renderers of 3DGS draw none; {SCALE_UP}"
 
 
 def too_small(views: Sequence[Camera], model: SplatModel, near: float, least: float) -> str:
@@ -235,7 +238,7 @@ def too_small(views: Sequence[Camera], model: SplatModel, near: float, least: fl
         return ""
     wrong = "the cameras seem to be in other units; give those of this scene"
     if max(view.fx for view in views) * width / least < width / 2 + CLEAR * near:
-        wrong = f"renderers of 3DGS draw nothing nearer than {near:g} units; scale the scene and its cameras up"
+        wrong = f"renderers of 3DGS draw nothing nearer than {near:g} units; {SCALE_UP}"
     return f"the scene is {units(width, 2)} units wide, and no view shows it larger than {units(most, 2)} px: {wrong}"
 
 

@@ -43,6 +43,9 @@ class IsRead(HasRows, SplatModel, Protocol):
 # Below one 8-bit step no 3DGS rasterizer draws a splat (diff-gaussian-rasterization, forward.cu).
 MIN_VISIBLE = 1 / 255
 
+# Trainings reset opacities to 0.01 every few thousand steps (INRIA's, gsplat's): a scene that is saved right after that is hardly visible.
+FAINT = 0.02
+
 # No image of the whole scene resolves an axis shorter than this fraction of it: the splat is a sheet or a needle.
 TINY_SHARE = 1e-6
 
@@ -89,6 +92,7 @@ class Health:
     huge: int  # longest axis above `extent`: one standard deviation covers the whole scene
     tiny: int  # shortest axis below TINY_SHARE · extent
     invisible: int  # opacity below MIN_VISIBLE
+    faint: bool  # all opacities are below FAINT, some not below MIN_VISIBLE; so may be those of a file that was adapted to x1/64
     sizeless: int  # longest axis below TINY_SHARE · extent
     unseen: int  # invisible or sizeless
     rounded: int  # steps between the numbers that hold its place are above COARSE_STEP of its size, and seen in an image of the whole scene
@@ -106,6 +110,7 @@ class Health:
             (self.tiny, f"have an axis below {TINY_SHARE:g} of the scene: sheets or needles"),
             (self.sizeless, "have no size: drawn as a dot where splats are dilated without compensation, and nowhere else"),
             (self.invisible, "have an opacity below 1/255 and are never drawn"),
+            (self.splats * self.faint, "have an opacity below 2 %, as right after training resets them; give a later checkpoint if it is faint"),
         ]
         remarks = [*self.non_finite(), *(f"{count:,} of {self.splats:,} splats {what}" for count, what in counts if count)]
         return remarks + self.doubts()
@@ -172,6 +177,7 @@ def examine(model: SplatModel) -> Health:
         huge=_rows(scales > extent) if extent > 0 else 0,
         tiny=_rows(thin),
         invisible=_rows(invisible),
+        faint=bool((opacities < FAINT).all()) and not invisible.all(),
         sizeless=_rows(sizeless),
         unseen=_rows(invisible | sizeless),
         rounded=len(steps),

@@ -73,8 +73,9 @@ def _entry(index: int, camera: Camera) -> dict[str, Any]:
 def _tests(names: list[str], path: Path) -> set[int]:
     """The places of the test cameras in a file with these names: the first ones, as INRIA writes it, or every eighth of a file sorted by name.
 
-    INRIA's readers hold out every eighth name of a COLMAP scene, and write these first, which no longer is the order of names. Warns of another
-    order of unique names, in which the test cameras may be others.
+    INRIA's readers hold out every eighth name of a COLMAP scene, and write these first, which no longer is the order of names. They sort names as
+    text, numbers too (0, 1, 10, 2), and so does this: in another order other views would be held out than in the training. Warns of another order of
+    unique names, in which the test cameras may be others.
     """
     first = count_test_cameras(names)
     leading, by_name = set(range(first)), sorted(names)

@@ -1,4 +1,4 @@
-"""COLMAP scenes, read by pycolmap: cameras sorted by name, every eighth for testing, as in mip-NeRF 360."""
+"""COLMAP scenes, read by pycolmap: cameras sorted by name, as text (10 before 2), every eighth for testing, as in mip-NeRF 360 and by INRIA."""
 
 from __future__ import annotations
 

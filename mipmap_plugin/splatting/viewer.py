@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from mipmap_plugin.allowed import OF_VIEWER, check
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, unknown
 from mipmap_plugin.render_settings import USUAL, RenderSettings
 from mipmap_plugin.screen_filters import SCREEN_FILTERS
 
@@ -42,7 +42,7 @@ class Viewer:
 
     def __post_init__(self) -> None:
         if not isinstance(self.screen_filter, str) or self.screen_filter not in SCREEN_FILTERS:
-            raise SettingsError(f"viewer {self.name!r}: there is no screen filter {self.screen_filter!r}; choose from {', '.join(SCREEN_FILTERS)}")
+            raise SettingsError(f"viewer {self.name!r}: {unknown('screen filter', str(self.screen_filter), [*SCREEN_FILTERS])}")
         if not isinstance(self.settings, RenderSettings):
             raise SettingsError(f"viewer {self.name!r}: settings must be RenderSettings, got {type(self.settings).__name__}")
         check(f"viewer {self.name!r}", self, OF_VIEWER, optional=frozenset({"near_plane"}))

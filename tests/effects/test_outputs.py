@@ -204,8 +204,9 @@ def test_any_backend_renders_outputs(monkeypatch):
 
 
 def test_an_unknown_output_is_refused():
-    with pytest.raises(SettingsError, match="there is no output 'albedo'; choose from depth, normals"):
-        wrapped(tiny.gaussians(3)).render(view(), outputs=["albedo"])
+    for name, guess in (("albedo", "$"), ("normal", "; did you mean normals")):
+        with pytest.raises(SettingsError, match=f"there is no output '{name}'; choose from depth, normals{guess}"):
+            wrapped(tiny.gaussians(3)).render(view(), outputs=[name])
 
 
 # The command

@@ -59,7 +59,7 @@ class Pace:
         """The pace of a run over `student` that has so many seconds left. The truths that are made for it are used later.
 
         `size`: the fraction of the base's size at which these are drawn. No image and no truth is made if more time than is left is expected of
-        it, by its pixels: of a large image its middle is measured.
+        it, by its pixels: of a large image its middle is measured. Validation, which uses no more than the middle, is measured as it is done.
         """
         views, validation = task.views[:REPEATS], task.validation
         cameras = [view.zoomed(task.scale) for view in views]
@@ -68,6 +68,9 @@ class Pace:
         def shortest(cameras: Sequence[Camera]) -> float:
             return _shortest(lambda camera: task.render(student.gaussians(camera), camera), cameras, device)
 
+        def validates(view: Camera) -> None:
+            validation.viewer_psnrs(student, [view])
+
         image, middle = 0.0, cameras[0].window(WINDOW, WINDOW)
         if middle.size != cameras[0].size:
             image = shortest([middle]) * math.prod(cameras[0].size) / math.prod(middle.size)
@@ -75,8 +78,10 @@ class Pace:
         truth = TRUTH_OVER_IMAGE * image * (size / task.scale) ** 2
         truth = truth if truth > left else _shortest(task.truth, views, device)
         moments = {view.time for view in validation.choosing} if task.follow.moments else ()
-        choice = STATES * (len(validation.choosing) * image + len(moments) * task.follow.evaluation)
-        return cls(STEP_OVER_IMAGE * image, truth, image * len(validation.steering), choice)
+        look = _shortest(validates, validation.steering[:REPEATS], device) if validation.steering else 0.0
+        first = _seconds(validates, validation.choosing[0], device) if validation.choosing else 0.0  # with its truth
+        choice = len(validation.choosing) * (first + (STATES - 1) * look) + STATES * len(moments) * task.follow.evaluation
+        return cls(STEP_OVER_IMAGE * image, truth, look * len(validation.steering), choice)
 
     def a_step(self, config: AdaptConfig) -> float:
         """With its part of the truths and the checks."""

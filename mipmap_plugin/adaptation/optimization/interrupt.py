@@ -10,7 +10,11 @@ from contextlib import contextmanager
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Inside, Ctrl-C is only recorded, and the yielded function returns whether it was pressed. A second Ctrl-C raises at once."""
+    """Inside, Ctrl-C is only recorded, and the yielded function returns whether it was pressed.
+
+    A second one raises KeyboardInterrupt as soon as Python runs, after a call of a kernel, in the middle of a step or of what the first one saves:
+    of the run is left what was saved before.
+    """
     pressed = False
 
     def record(number: int, frame: object) -> None:

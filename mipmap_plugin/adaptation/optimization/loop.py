@@ -40,7 +40,7 @@ TRUTHS_AT_ONCE, STEPS_AHEAD = 4, 2
 def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run], None], observe: Callable[[Run], object] = lambda run: None) -> End:
     """Optimize `run.student` in place until its steps, budget, target or patience end the run; return which of them did.
 
-    `on_interrupt` is called between two steps when Ctrl-C was pressed, and should raise. `observe` is called before the first
+    `on_interrupt` is called between two steps, or after the last, when Ctrl-C was pressed, and should raise. `observe` is called before the first
     step and after each step; its time is not counted, and the run ends if it returns True.
     """
     order, cameras = ViewSchedule(task.views, config), {view: view.zoomed(task.scale) for view in task.views}
@@ -71,6 +71,8 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
             undo_harmful_growth(run, task, config)
             if run.curve[-1].step < run.step:
                 _check(run, task, config)
+        if interrupted():
+            on_interrupt(run)
     return reason or End.STEPS
 
 
