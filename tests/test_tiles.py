@@ -172,7 +172,7 @@ def test_pictures_come_back_one_by_one(tmp_path):
     write_pictures(tmp_path / "a", ((name, picture, (1, 2, 3, 4) if "/" in name else None) for name, picture in pictures.items()))
     album = Album([tmp_path / "a"])
     assert all(torch.equal(album[name], picture) for name, picture in pictures.items())
-    assert album.entry("2/0").box == (1, 2, 3, 4) and album.entry("1").box is None and "3" not in album
+    assert album.box("2/0") == (1, 2, 3, 4) and album.box("1") is None and "3" not in album
 
 
 def test_slabs_give_the_picture_of_all_splats(on_disk, monkeypatch):

@@ -55,7 +55,7 @@ def _halos(scene: TiledScene, view: Camera, layers: list[Album]) -> Iterator[tup
     and the fraction of the pixel's blend weights that the tile has."""
     size = view.zoomed(scene.scale).size
     seen = [number for number in front_to_back(scene.tree, view.center.tolist()) if view.name in layers[number]]
-    boxes = {number: layers[number].entry(view.name).box or (0, 0, size[1], size[0]) for number in seen}
+    boxes = {number: layers[number].box(view.name) or (0, 0, size[1], size[0]) for number in seen}
     pictures = {number: layers[number][view.name].float() for number in seen}
     fronts, through = {}, torch.ones(*size, 1)
     for number in seen:

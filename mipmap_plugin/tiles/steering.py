@@ -13,8 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from itertools import count
 from pathlib import Path
 
-from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
-from mipmap_plugin.adaptation.optimization.validation import HARM_DB, RATE_REDUCTION, TIE_DB, Steering
+from mipmap_plugin.adaptation.optimization.validation import HARM_DB, RATE_REDUCTION, TIE_DB, warmed_up
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.torch_file import load_torch
@@ -107,4 +106,4 @@ def next_planned(scene: TiledScene, sweep: Sweep) -> Sweep | None:
 
 def rate_factor(scene: TiledScene, step: int, ceiling: float) -> float:
     """The factor of all rates in a step."""
-    return Steering(0.0, 0.0, Snapshot({}, {}), ceiling=ceiling).rate_factor(step, scene.config)
+    return min(warmed_up(step, scene.config), ceiling)

@@ -70,7 +70,7 @@ class Surroundings:
         return replace(target, width=right - left, height=bottom - top, cx=target.cx - left, cy=target.cy - top, zoom=1.0)
 
     def _box(self, name: str) -> Box:
-        box = self._halos.entry(f"{name}/{self._number}").box
+        box = self._halos.box(f"{name}/{self._number}")
         assert box is not None  # since those of tiles have one
         return box
 
@@ -87,7 +87,7 @@ class Surroundings:
         through, behind, share = (self._halos[f"{name}/{self._number}"].float() / FINE).split((1, 3, 1), dim=2)
         image = within(from_16_bits(self._halos[name]), box)
         truth = within(self._truths.named(name), box)
-        x, y = (self._layers.entry(name).box or (0, 0))[:2]
+        x, y = (self._layers.box(name) or (0, 0))[:2]
         left, top, right, bottom = box
         before = within(self._layers[name], (left - x, top - y, right - x, bottom - y)).float()
         core = through * before[..., :3] + before[..., 3:] * behind
