@@ -45,7 +45,8 @@ def read_transforms(path: str | Path) -> Scene:
     notes: list[str] = []
     lenses: dict[Path, Lens] = {}
     distorted: list[Lens] = []
-    for file, split in transforms_files(path):
+    files = transforms_files(path)
+    for file, split in files:
         views, absent = _read_file(file, split)
         cameras += [camera for camera, _, _ in views]
         images |= {camera: image for camera, image, _ in views if image}
@@ -56,9 +57,9 @@ def read_transforms(path: str | Path) -> Scene:
             notes.append(f"{file.name}: {_counted(absent)} {ABSENT}{_left_out(unsized)}")
     if not cameras:
         raise SceneError(f"{path}: none of the listed images is there, and the sizes are unknown; add the images, or w and h to the file")
-    first = transforms_files(path)[0][0]
-    notes += [note(distorted, len(distorted)) + ("" if can_undistort() else f"; pycolmap does that: {INSTALL}")] if distorted else []
-    return Scene(tuple(cameras), images, path, notes, applied=_applied(first), applied_scale=_applied_scale(first), lenses=lenses)
+    notes += [note(distorted) + ("" if can_undistort() else f"; pycolmap does that: {INSTALL}")] if distorted else []
+    applied, applied_scale = _applied(files[0][0])
+    return Scene(tuple(cameras), images, path, notes, applied=applied, applied_scale=applied_scale, lenses=lenses)
 
 
 def transforms_files(path: Path) -> list[tuple[Path, Literal["train", "test"]]]:
@@ -129,16 +130,14 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[tuple[
     return views, absent
 
 
-def _applied(file: Path) -> Tensor | None:
-    """nerfstudio's `applied_transform` [4, 4], which was applied to COLMAP's world already; old files do not record it."""
-    data = read_json(file)
-    if "applied_transform" not in data:
-        return _pose(USUAL_TURN, str(file)) if file.name == "transforms.json" and (file.parent / "colmap/sparse/0").exists() else None
-    return _pose(data["applied_transform"], f"{file}, applied_transform")
-
-
-def _applied_scale(file: Path) -> float:
-    return positive(read_json(file).get("applied_scale", 1.0), f"{file}, applied_scale")
+def _applied(file: Path) -> tuple[Tensor | None, float]:
+    """nerfstudio's `applied_transform` [4, 4] and its scale, which were applied to COLMAP's world already; old files record no transform."""
+    data, transform = read_json(file), None
+    if "applied_transform" in data:
+        transform = _pose(data["applied_transform"], f"{file}, applied_transform")
+    elif file.name == "transforms.json" and (file.parent / "colmap/sparse/0").exists():
+        transform = _pose(USUAL_TURN, str(file))
+    return transform, positive(data.get("applied_scale", 1.0), f"{file}, applied_scale")
 
 
 def _image(folder: Path, listed: str) -> Path | None:
