@@ -15,7 +15,6 @@ from tqdm import tqdm
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.cells import Cells
 from mipmap_plugin.evaluation.measure import (
     FILTERS,
@@ -32,7 +31,7 @@ from mipmap_plugin.evaluation.metrics import psnr, ssim
 from mipmap_plugin.evaluation.other_scene import of_another_scene
 from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.photographs import digest_of_image
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, not_exposed, test_views
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, judged_views, not_exposed
 from mipmap_plugin.evaluation.shots import Recorder, Shot, Watcher
 from mipmap_plugin.models.base import SplatModel, effects_of
 from mipmap_plugin.recipes import most_steps
@@ -190,11 +189,7 @@ def evaluator_of(
     model: Wrapped, scene: Scene, protocol: str, perceptual: Perceptual | None = None, cells: Cells | None = None
 ) -> Evaluator:
     """What compares a model with the photographs of its scene; `cells`: where finished rows are kept. Raises SettingsError."""
-    scene = model.place(scene)
-    if not model.cameras:
-        raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder, or its cameras (--cameras)")
-    views = test_views(scene, model.cameras, model.background)
-    return Evaluator(views, PROTOCOLS[protocol], perceptual, scene.source.name, cells=cells or Cells(), notes=scene.notes)
+    return Evaluator(judged_views(model, scene), PROTOCOLS[protocol], perceptual, scene.source.name, cells=cells or Cells(), notes=scene.notes)
 
 
 def evaluate(

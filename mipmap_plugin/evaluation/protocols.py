@@ -28,6 +28,7 @@ from mipmap_plugin.evaluation.photographs import Photographs
 from mipmap_plugin.formats.images import averaged_straight, has_alpha, image_size, pillow_bicubic, read_image, read_straight
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.scenes import Scene
+from mipmap_plugin.wrap import Wrapped
 
 # COLMAP scenes include smaller copies of their photographs: images_2, images_4, images_8 beside images.
 READY_MADE = re.compile(r"images(_\d+)?$")
@@ -134,6 +135,14 @@ def ready_made(photograph: Path, size: tuple[int, int]) -> Path:
     available = ", ".join(f"{width} x {height}" for width, height in sizes.values()) or "none"
     required = f"{photograph.name} at {size[1]} x {size[0]} px in a folder images_2, images_4, ... of its scene"
     raise SettingsError(f"P4 needs {required}, but there is {available}; evaluate a scale that has one, or by P3")
+
+
+def judged_views(model: Wrapped, scene: Scene) -> list[TestView]:
+    """`test_views` of the scene of a model. Raises SettingsError, too, if the model has no cameras and gets none of the scene."""
+    scene = model.place(scene)
+    if not model.cameras:
+        raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder, or its cameras (--cameras)")
+    return test_views(scene, model.cameras, model.background)
 
 
 def test_views(scene: Scene, base: Sequence[Camera], background: tuple[float, float, float]) -> list[TestView]:
