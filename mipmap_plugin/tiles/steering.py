@@ -2,8 +2,8 @@
 
 A tile by itself cannot tell: what it shows of a view is a part of its error. In the warm-up a state does harm if it is worse than the start, as
 without tiles; later if it is worse than the best of its sweep, or than what that began with: in front of halos that stay as they are, rates
-that are too high drive all tiles further and further off. On flowers (300,000 and a million splats, 8 tiles, 60 steps) the first 13 steps
-after the warm-up ended below the start so, and done again at half of the rates 1 to 2 dB above the best before.
+that are too high drive all tiles further and further off (the first steps after the warm-up of flowers with a million splats ended below the
+start so, and done again at half of the rates 1 to 2 dB above the best before).
 """
 
 from __future__ import annotations

@@ -30,15 +30,14 @@ from mipmap_plugin.screen_filters import INTEGRATED
 POWERS = (1, 1 / 2, 1 / 4)
 
 # dB that the mildest may cost before steps for a renderer that draws otherwise than the training did, also where other merging may cost less: fewer
-# splats learn that sooner, and better. Lego at x1/8 gains 0.9 dB for spark, 0.8 with the `thorough` recipe, and 1.0 for three.js, chair 0.8 for
-# three.js; bird has as much with three fifths of its splats. What stronger ones cost does not come back: 0.3 to 1.2 dB of chair, 0.4 of flowers.
+# splats learn that sooner, and better, but what stronger merging costs does not come back (docs/recipes_found.md).
 MILD_COSTS = 0.6
 
 # Before them, what starts from a finer level is merged even where too few of its splats share a pixel: else chair would keep half of them at x0.57.
-# What is left has to show at least so many dB: from 29 dB lego's steps regain all that merging cost, from 20 dB those of flowers, a capture, a third.
+# What is left has to show at least so many dB: from 29 dB steps regained all that merging cost, from 20 dB a third.
 COARSE_POWERS, LEAST_DB = (1, 7 / 8, 3 / 4, 5 / 8, 1 / 2), 25.0
 
-# dB by which what is left may be worse than the base itself: steps regain 3 to 8 dB, of lego, of chair and of a capture. What fails is merged less.
+# dB by which what is left may be worse than the base itself: steps regain 3 to 8 dB. What fails is merged less.
 COARSE_COSTS = 3.0
 
 # The fraction of a time budget that the start may take: what it would not finish in it is left out, from the strongest merging on.

@@ -12,22 +12,20 @@ opacity can make up for, so that the blend weight stays the same. For a viewer t
 
 Zoom-in (s > 1) widens the splats, but by less: the images that a base was trained on are averages over pixels, which have a variance of
 p = 1/12 px², and the adapted images should be averages over their own, smaller pixels. Σ + e·ρ² includes this average, so that e and e'
-are both reduced by p, and the opacity is raised by the area that is lost (+0.3 dB after the default steps on photographs of lego and chair
-at x2 and x4). Images of the base's size do not show how much of e is such an average, and how much is a splat's own extent: all values
-from p = 1/12 to p = e give nearly the same image. A larger p is crisper: with p = e splats keep their size, and only opacity makes up for
-what a zoom takes off them (`FormSettings.crispness`).
+are both reduced by p, and the opacity is raised by the area that is lost. Images of the base's size do not show how much of e is such an
+average, and how much is a splat's own extent: all values from p = 1/12 to p = e give nearly the same image. A larger p is crisper: with
+p = e splats keep their size, and only opacity makes up for what a zoom takes off them (`FormSettings.crispness`).
 
 A file that is rendered with the base's own filter needs no change if that filter integrates over the pixel. One that compensates models the
 pixel in each view too, but with a variance of its own, and overlapping splats whose opacities it lowers let through more than their means
-would: with matched opacities the closed form is better by 2 to 8 dB (lego and chair, antialiased, x1/4, x1/8, x2 and x4), at x0.7 it is not.
-Without these, and before the steps of a zoom-out, it is left out.
+would: with matched opacities the closed form is better by 2 to 8 dB, but near the base's scale it is not. Without these, and before the steps
+of a zoom-out, it is left out.
 
 Opacities from areas are exact for splats that hide nothing; where blend weights are known they are matched afterwards (`matching`).
 
 At zoom-out the distance is that of the closest view, which saw the finest detail that training could resolve (as for the 3D filter of
 Mip-Splatting): elsewhere splats then stay too wide, and lower opacities make up for it. At zoom-in they would leave holes in views from
-farther away, so they are widened for the mean of the views (`mean_pixel_size`). Without steps this is worth 0.3 to 0.4 dB on photographs of
-lego and chair at x2 and x4, and 2.6 dB on a capture of flowers at x2.
+farther away, so they are widened for the mean of the views (`mean_pixel_size`).
 """
 
 from __future__ import annotations
