@@ -74,9 +74,7 @@ def tradeoff(
     from mipmap_plugin.evaluation.tradeoff.files import KEPT, Folder, refuse
     from mipmap_plugin.evaluation.tradeoff.points import Plan
     from mipmap_plugin.evaluation.tradeoff.run import run
-
-    folder = Folder(output, picture, overwrite)
-    refuse(folder)
+    refuse(folder := Folder(output, picture, overwrite))
     page = tradeoff_page_path(output, overwrite) if report else None
     plan = Plan(recipe or ("default", "paper"), steps, backend or ("auto",), supersampling or (2, 4, 8), renderers, repeats, seed, viewer)
     base = Base(checkpoint, cameras, background, screen_filter=screen_filter, up=up)

@@ -32,11 +32,10 @@ ROOTS = (1, 2, 4)
 
 
 class StartSearch:
-    """Tries the starts of `adaptation.start.candidates` on the whole scene, and leaves the best in `folder`."""
+    """Tries the starts of `adaptation.start.candidates` on the whole scene, and leaves the best in its folder."""
 
-    def __init__(self, scene: TiledScene, folder: Path) -> None:
-        self.scene, self.folder = scene, folder
-        self.truths = Truths(scene, folder)
+    def __init__(self, scene: TiledScene) -> None:
+        self.scene, self.truths = scene, Truths(scene)
         effects = scene.base_effects, scene.target
         self.forms = scene.config.closed_form and not (filter_suffices(*effects) or draws_alike(*effects))
         self.matches = scene.scale <= 1 and self.forms
@@ -72,7 +71,7 @@ class StartSearch:
         return psnr(self.scene, splats, self.truths, self.scene.views.steering)
 
     def _file(self, name: str, number: int) -> Path:
-        return self.folder / f"{name}_{number}.splats"
+        return self.scene.folder / f"{name}_{number}.splats"
 
     def _open(self, name: str) -> Splats:
         return Splats.of(self.scene.kind, [Store(self._file(name, number)) for number in range(len(self.scene.cores))])
@@ -144,8 +143,8 @@ class StartSearch:
     def _take(self, name: str, title: str, psnr: float) -> None:
         """Leave the splats of a candidate as the start."""
         for number in range(len(self.scene.cores)):
-            self._file(name, number).replace(start_file(self.folder, number))
-        save_torch(self.folder / START, {"name": title, "psnr": psnr}, overwrite=True)
+            self._file(name, number).replace(start_file(self.scene.folder, number))
+        save_torch(self.scene.folder / START, {"name": title, "psnr": psnr}, overwrite=True)
 
 
 def _set_opacities(model: VanillaModel, opacities: Tensor) -> None:

@@ -54,14 +54,14 @@ class Steered:
         return start_file(folder, number) if self.sweep < 0 else tile_file(folder, number, self.sweep, self.step)
 
 
-def sweep_of(scene: TiledScene, folder: Path, number: int) -> Sweep | None:
+def sweep_of(scene: TiledScene, number: int) -> Sweep | None:
     """The `number`-th sweep that is made, once the one before it was steered; None if there is none."""
-    return Steered.before(folder, number).following if number else next(iter(scene.sweeps), None)
+    return Steered.before(scene.folder, number).following if number else next(iter(scene.sweeps), None)
 
 
-def open_state(scene: TiledScene, folder: Path, state: Steered) -> Splats:
+def open_state(scene: TiledScene, state: Steered) -> Splats:
     """The splats of all tiles in a state, tile after tile."""
-    return Splats.of(scene.kind, [Store(state.file(folder, number)) for number in range(len(scene.cores))])
+    return Splats.of(scene.kind, [Store(state.file(scene.folder, number)) for number in range(len(scene.cores))])
 
 
 def result(folder: Path) -> Steered:
@@ -69,15 +69,15 @@ def result(folder: Path) -> Steered:
     return Steered.before(folder, next(number for number in count() if not steered_file(folder, number).exists()))
 
 
-def steer(scene: TiledScene, sweep: Sweep, folder: Path) -> None:
+def steer(scene: TiledScene, sweep: Sweep) -> None:
     """Measure the whole at each check of a sweep, and write what the next sweep begins with."""
-    before = Steered.before(folder, sweep.number)
-    truths, psnrs, harmful, start_db = Truths(scene, folder), [], False, load_torch(folder / START)["psnr"]
+    before = Steered.before(scene.folder, sweep.number)
+    truths, psnrs, harmful, start_db = Truths(scene), [], False, load_torch(scene.folder / START)["psnr"]
     best, best_db, ceiling = before, before.psnr if sweep.number else start_db, before.ceiling
     warms_up = sweep.end <= scene.config.warm_up_steps  # rates that lose a little in a few steps may gain in many
     for step in sweep.checks:
         state = Steered(sweep.number, step)
-        psnrs.append(psnr(scene, open_state(scene, folder, state), truths, scene.views.steering))
+        psnrs.append(psnr(scene, open_state(scene, state), truths, scene.views.steering))
         if psnrs[-1] < (start_db if warms_up else best_db) - HARM_DB and scene.config.returns == "best":
             ceiling, harmful = RATE_REDUCTION * rate_factor(scene, step, ceiling), True
             break
@@ -88,7 +88,7 @@ def steer(scene: TiledScene, sweep: Sweep, folder: Path) -> None:
     again = harmful and not warms_up and sweep.repeats < MOST_REPEATS
     following = repeated(sweep, best) if again else next_planned(scene, sweep)
     after = Steered(best.sweep, best.step, ceiling, tuple(psnrs), best_db, following)
-    write_json(steered_file(folder, sweep.number), asdict(after), overwrite=True)
+    write_json(steered_file(scene.folder, sweep.number), asdict(after), overwrite=True)
 
 
 def repeated(sweep: Sweep, best: Steered) -> Sweep:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from threading import Lock
 from typing import ClassVar
 
@@ -51,12 +50,12 @@ class _Surrounding:
 class Surroundings:
     """The halo of a tile in a sweep's views; with splats of the core and a crop's camera, it renders both together."""
 
-    def __init__(self, scene: TiledScene, number: int, sweep: Sweep, folder: Path) -> None:
+    def __init__(self, scene: TiledScene, number: int, sweep: Sweep) -> None:
         self._scene, self._number = scene, number
         self._effects = on_black(scene.target)
-        self._truths = Truths(scene, folder)
-        self._layers = Album([layer_file(folder, number, sweep.halos)])
-        self._halos = Album(halo_file(folder, part, sweep.halos) for part in range(parts(scene.sweep_views(sweep))))
+        self._truths = Truths(scene)
+        self._layers = Album([layer_file(scene.folder, number, sweep.halos)])
+        self._halos = Album(halo_file(scene.folder, part, sweep.halos) for part in range(parts(scene.sweep_views(sweep))))
         self._kept: dict[str, _Surrounding] = {}
         self._lock = Lock()  # views are asked for side by side
 
