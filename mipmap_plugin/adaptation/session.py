@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from mipmap_plugin.adaptation.adapted import Adapted
-from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, is_true
+from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch
 from mipmap_plugin.adaptation.following import Following, release
 from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_trained, psnr_per_viewer
 from mipmap_plugin.adaptation.moments import at_their_moments, evaluate_moments
@@ -26,7 +26,7 @@ from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Quality, Validation, split_validation
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, unrounded, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, versions
-from mipmap_plugin.adaptation.request import AdaptationRequest, Observer
+from mipmap_plugin.adaptation.request import AdaptationRequest, Observer, ends_run
 from mipmap_plugin.adaptation.start.candidates import UNMATCHED, StartSearch
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
 from mipmap_plugin.adaptation.start.problem import StartProblem
@@ -180,7 +180,7 @@ class Session:
         def after_step(run: Run) -> bool:
             keeper.save_if_due(run)
             try:
-                return is_true(observe and observe(run.step, run.watch.seconds, first.of_model(run.student)))
+                return ends_run(observe and observe(run.step, run.watch.seconds, first.of_model(run.student)))
             except KeyboardInterrupt:  # as between two steps
                 keeper.save_and_stop(run)
 
@@ -258,7 +258,7 @@ class Session:
     def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str, returned: str, validation: dict[str, float]) -> Report:
         known = [*self.base.notes, *(self.finer.model.notes if self.finer else ())]
         notes = [*self.notes, *(note for note in student.notes if note not in known)]
-        as_trained = psnr_as_trained(self.validation, self.backend, self.targets, self.base, self.base_effects) if validation else None
+        as_trained = psnr_as_trained(self.validation, self.backend, self.targets, self.base, self.base_effects)
         shown = next((psnr for state, psnr in validation.items() if returned.startswith(state)), 0.0)
         notes += better_as_trained(as_trained, shown, self.base_effects)
         for note in notes:
