@@ -24,7 +24,7 @@ from mipmap_plugin.adaptation.target.photographs import at_density_of
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.evaluation.photographs import Photographs
+from mipmap_plugin.evaluation.photographs import kept_photographs
 from mipmap_plugin.formats.images import averaged_straight, has_alpha, image_size, pillow_bicubic, read_image, read_straight
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.scenes import Scene
@@ -154,14 +154,8 @@ def test_views(scene: Scene, base: Sequence[Camera], background: tuple[float, fl
     cameras = [c for c in cameras if c.split == "test"] or cameras
     if not cameras:
         raise SettingsError(f"{scene.source}: there are no photographs to compare with")
-
-    photographs = Photographs(scene, background)
-
-    def view(original: Camera, camera: Camera) -> TestView:
-        file = scene.images[original]
-        return TestView(camera, photographs.of(original), file, background, file in scene.lenses, has_alpha(file))
-
-    return [*map(view, cameras, at_density_of(cameras, base))]
+    views = zip(at_density_of(cameras, base), kept_photographs(scene, cameras, background), (scene.images[c] for c in cameras), strict=True)
+    return [TestView(camera, photograph, file, background, file in scene.lenses, has_alpha(file)) for camera, photograph, file in views]
 
 
 def not_exposed(model: SplatModel) -> list[str]:
