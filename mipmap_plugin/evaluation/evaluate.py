@@ -31,7 +31,7 @@ from mipmap_plugin.evaluation.metrics import psnr, ssim
 from mipmap_plugin.evaluation.other_scene import of_another_scene
 from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.photographs import digest_of_image
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, judged_views, not_exposed
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, not_exposed, photographed_views
 from mipmap_plugin.evaluation.shots import Recorder, Shot, Watcher
 from mipmap_plugin.models.base import SplatModel, effects_of
 from mipmap_plugin.recipes import most_steps
@@ -113,14 +113,13 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def training_free_rows(
-    model: Wrapped, judge: Evaluator, scale: float, upsampler: str = "bicubic", without: Sequence[str] = (), viewer: str | None = None
+    model: Wrapped, judge: Evaluator, scale: float, upsampler: str = "bicubic", filters: Sequence[str] = FILTERS, viewer: str | None = None
 ) -> list[Row]:
     """Rows of the base as it is and of all training-free improvements of it (`measure.baselines`).
 
-    `without`: filters to leave out. `viewer`: adds a row of the base as this viewer renders it.
+    `viewer`: adds a row of the base as this viewer renders it.
     """
     count = len(model.model.gaussians(model.any_camera()))
-    filters = [name for name in FILTERS if name not in without]
     found = baselines(model, scale, judge.protocol.shrink_by, filters=filters, upsampler=upsampler)
     in_viewers = [base_in_viewer(name, model, scale) for name in viewers_for(viewer)] if viewer else []
 
@@ -189,7 +188,7 @@ def evaluator_of(
     model: Wrapped, scene: Scene, protocol: str, perceptual: Perceptual | None = None, cells: Cells | None = None
 ) -> Evaluator:
     """What compares a model with the photographs of its scene; `cells`: where finished rows are kept. Raises SettingsError."""
-    return Evaluator(judged_views(model, scene), PROTOCOLS[protocol], perceptual, scene.source.name, cells=cells or Cells(), notes=scene.notes)
+    return Evaluator(photographed_views(model, scene), PROTOCOLS[protocol], perceptual, scene.source.name, cells=cells or Cells(), notes=scene.notes)
 
 
 def evaluate(

@@ -137,7 +137,7 @@ def ready_made(photograph: Path, size: tuple[int, int]) -> Path:
     raise SettingsError(f"P4 needs {required}, but there is {available}; evaluate a scale that has one, or by P3")
 
 
-def judged_views(model: Wrapped, scene: Scene) -> list[TestView]:
+def photographed_views(model: Wrapped, scene: Scene) -> list[TestView]:
     """`test_views` of the scene of a model. Raises SettingsError, too, if the model has no cameras and gets none of the scene."""
     scene = model.place(scene)
     if not model.cameras:
