@@ -25,7 +25,7 @@ from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Quality, Validation, split_validation
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, unrounded, views_renderer
-from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, versions
+from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, simulated, versions
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer, ends_run
 from mipmap_plugin.adaptation.start.candidates import UNMATCHED, StartSearch
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
@@ -39,8 +39,7 @@ from mipmap_plugin.adaptation.views import choose_views, orbit_of, over_band, re
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.effects import Effect, explain
-from mipmap_plugin.models.base import SplatModel, count_of, digest_of_model, digest_of_parameters, effects_of
+from mipmap_plugin.models.base import SplatModel, count_of, digest_of_model, digest_of_parameters
 from mipmap_plugin.models.health import doubts_in
 from mipmap_plugin.process import pool, threads
 from mipmap_plugin.process.clock import now
@@ -159,15 +158,20 @@ class Session:
         model = states[best].copy() if getattr(states[best], "shares", False) else states[best]
         return Adapted(model, report, self.backend, self.effects, self.targets, files, used, judge=self.validation.kept())
 
+    def _task(self, student: SplatModel, first: Renderer, further: Sequence[Renderer]) -> Task:
+        """What is optimized from `student` on: up to how many splats, and by which of the ways to draw them that the backend has."""
+        growth, targets = self.config.most_growth, [renderer.effects for renderer in (first, *further)]
+        return Task(
+            self.views, self.scale, self.truth, first, self.effects.background == (1.0, 1.0, 1.0), self.validation, self.detail,
+            max_splats=self._most_splats if growth is None else min(self._most_splats, int(growth * len(student.parameters()["means"]))),
+            further_renders=further, render_views=views_renderer(self.backend, targets),
+            render_to_step=SteppingRenderer.of(self.backend, targets), follow=Following(self.base, self.views, self.scale),
+        )  # fmt: skip
+
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
         """Run Algorithm 1 on `student`, or continue it from the state in `resume`; return the run and what ended it."""
-        growth = self.config.most_growth
-        max_splats = self._most_splats if growth is None else min(self._most_splats, int(growth * len(student.parameters()["means"])))
-        targets = [unrounded(target) for target in self.extremes.values()]
-        first, *further = [Renderer(self.backend, target) for target in targets]
-        together, stepping = views_renderer(self.backend, targets), SteppingRenderer.of(self.backend, targets)
-        white, follow = self.effects.background == (1.0, 1.0, 1.0), Following(self.base, self.views, self.scale)
-        task = Task(self.views, self.scale, self.truth, first, white, self.validation, self.detail, max_splats, further, together, stepping, follow)
+        first, *further = [Renderer(self.backend, unrounded(target)) for target in self.extremes.values()]
+        task = self._task(student, first, further)
         keeper = StateKeeper(resume, self._fingerprint())
         if not any(target.sh_degree for target in self.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no viewer evaluates view-dependent color, so that these coefficients need no gradient
@@ -249,12 +253,6 @@ class Session:
         facts = [base, dict(self.request.inputs), self.scale, settings, self.backend.name, asdict(self.base_effects), targets, views]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
-    def _effects(self) -> list[Effect]:
-        """Every effect; it is on where it is on in any viewer that the file is made for."""
-        gaussians, model_effects = self.base.gaussians(self.views[0]), effects_of(self.base)
-        per_viewer = [explain(target, gaussians, model_effects, self.config, self.scale) for target in self.targets.values()]
-        return [next((effect for effect in same if effect.on), same[0]) for same in zip(*per_viewer, strict=True)]
-
     def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str, returned: str, validation: dict[str, float]) -> Report:
         known = [*self.base.notes, *(self.finer.model.notes if self.finer else ())]
         notes = [*self.notes, *(note for note in student.notes if note not in known)]
@@ -271,7 +269,7 @@ class Session:
             views=self.views_note,
             viewer=self.request.viewer,
             filters=filters(self.scale, self.config, self.base_effects, list(self.targets.values())),
-            effects=self._effects(),
+            effects=simulated(self.base, self.views[0], self.targets.values(), self.config, self.scale),
             gaussians_before=len(self.base.gaussians(self.views[0])),
             gaussians_after=len(student.gaussians(self.views[0])),
             seconds=self.seconds,
