@@ -11,7 +11,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.optimization.validation import mean_db
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.blend_weights import may_show, whole_weights
-from mipmap_plugin.adaptation.start.candidates import MILD_COSTS, start_name
+from mipmap_plugin.adaptation.start.candidates import mildest_costs, start_name
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import matched_opacities
 from mipmap_plugin.adaptation.start.merging import merge_seen
@@ -54,17 +54,12 @@ class StartSearch:
         for root in ROOTS if config.merge_to < 1 else ():
             self._candidate("merged", weights, config.merge_to ** (1 / root))
             merged_db = self.steer(self._open("merged"))
-            if merged_db >= max(formed_db - self._may_cost(root), base_db):
+            costs = mildest_costs(config, scene.base_effects, scene.target) if root == ROOTS[-1] else config.merging_costs
+            if merged_db >= max(formed_db - costs, base_db):
                 return self._take("merged", start_name(self.forms, merged=True), merged_db)
         if formed_db < base_db or not self.forms:
             return self._take_base(base_db)
         return self._take("formed", start_name(self.forms), formed_db)
-
-    def _may_cost(self, root: int) -> float:
-        """How many dB merging to this root of `merge_to` may cost, as without tiles: the mildest more before steps for another renderer."""
-        scene, costs = self.scene, self.scene.config.merging_costs
-        learns = scene.config.steps > 0 and scene.base_effects != scene.target
-        return max(costs, MILD_COSTS) if root == ROOTS[-1] and learns and costs else costs
 
     def steer(self, splats: Splats) -> float:
         """PSNR (dB) on the steering views."""
