@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.validation import mean_db
+from mipmap_plugin.adaptation.pixel_size import enough_views, pixel_size
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.blend_weights import may_show, whole_weights
 from mipmap_plugin.adaptation.start.candidates import mildest_costs, start_name
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import matched_opacities
 from mipmap_plugin.adaptation.start.merging import merge_seen
-from mipmap_plugin.adaptation.start.pixel_size import enough_views, pixel_size
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.gaussians import Gaussians

@@ -20,8 +20,8 @@ from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.quickest import QuickestThreads
 from mipmap_plugin.adaptation.optimization.validation import Steering, Validation
+from mipmap_plugin.adaptation.pixel_size import pixel_size
 from mipmap_plugin.adaptation.renderers import SteppingRenderer, ViewsRenderer
-from mipmap_plugin.adaptation.start.pixel_size import pixel_size
 from mipmap_plugin.adaptation.target.resize import difference_from
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.validation import Quality
+from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS, mean_pixel_size, pixel_size, views_for
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights, may_show, weighed, whole_weights
 from mipmap_plugin.adaptation.start.clock import Clock
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import ROUNDS, matched_opacities
 from mipmap_plugin.adaptation.start.merging import Rounds, merge_down, merge_seen
-from mipmap_plugin.adaptation.start.pixel_size import LEAST_VIEWS, mean_pixel_size, pixel_size, views_for
 from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.adaptation.start.thinning import evenly_in_space, least_fraction
 from mipmap_plugin.camera import evenly
