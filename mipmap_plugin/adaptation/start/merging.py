@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import count as count_from
 
 import torch
@@ -187,7 +187,8 @@ class _Moments:
         unpaired = torch.ones_like(self.weights, dtype=torch.bool).index_fill_(0, torch.cat([first, second]), False)
         rows, kept = unpaired.cumsum(0) - 1, unpaired.nonzero()[:, 0]
         rows[first] = rows[second] = torch.arange(len(first), device=rows.device) + len(kept)
-        return _Moments(*(torch.cat([getattr(self, field.name)[kept], getattr(pairs, field.name)]) for field in fields(self))), rows
+        both = zip(vars(self).values(), vars(pairs).values(), strict=True)
+        return _Moments(*(torch.cat([own[kept], merged]) for own, merged in both)), rows
 
     def gaussians(self, before: Gaussians, rows: Tensor, old_weights: Tensor) -> Gaussians:
         """Return the merged splats. `rows` [N0]: the new row of each splat of `before`. Splats that were not merged stay bit-identical."""
