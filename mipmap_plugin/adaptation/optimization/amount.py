@@ -106,7 +106,7 @@ def affordable(config: AdaptConfig, in_view: float) -> AdaptConfig:
 def _fewer(config: AdaptConfig, fraction: float) -> AdaptConfig:
     """The settings with a fraction of the steps.
 
-    Fewer steps have fewer extra views, of which each costs a picture of the base, and smaller pictures, which are as good for them.
+    Fewer steps have fewer extra views, of which each costs a picture of the base, and smaller pictures, as good for them (docs/recipes_found.md).
     """
     fewer = {"steps": math.ceil(fraction * config.steps), "extra_views": math.ceil(fraction**0.5 * config.extra_views)}
     if config.truth_oversampling is not None:
