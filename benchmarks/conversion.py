@@ -26,7 +26,7 @@ from mipmap_plugin import Camera, load_scene, wrap_model
 from mipmap_plugin.adaptation.curve import decibel
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.evaluation.metrics import psnr
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, photographed_views
 from mipmap_plugin.evaluation.report import markdown
 from mipmap_plugin.formats.atomic import new_file, write_json
 from mipmap_plugin.wrap import Wrapped
@@ -72,7 +72,7 @@ def prepared(name: str, data: Path | None) -> tuple[Wrapped, Callable[[float], C
         raise SystemExit(f"{name} needs DATA, or there is no such capture; known are {', '.join((*CAPTURES, *BASES))}")
     base = wrap_model(data / "checkpoints" / BASES[name], threads=1)
     scene = load_scene(data / "images" / name.split("_")[0])
-    shots = evenly(test_views(base.place(scene), base.cameras, base.background), JUDGED)
+    shots = evenly(photographed_views(base, scene), JUDGED)
 
     def by_photographs(scale: float) -> Callable[[Show], float]:
         p3 = PROTOCOLS["P3"]

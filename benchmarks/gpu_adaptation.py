@@ -19,7 +19,7 @@ from mipmap_plugin import load_model, load_scene, wrap_model
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.evaluation.evaluate import Evaluator, adapted_row
 from mipmap_plugin.evaluation.measure import adapt_alone
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, photographed_views
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import Wrapped
@@ -98,7 +98,7 @@ class Subject:
         images = place.data / "images" / base.name.split("_")[0]
         judge = None
         if images.is_dir():
-            judge = Evaluator(test_views(wrapped.place(load_scene(images)), wrapped.cameras, wrapped.background), PROTOCOLS["P3"])
+            judge = Evaluator(photographed_views(wrapped, load_scene(images)), PROTOCOLS["P3"])
         return cls(base, wrapped, judge, place)
 
     def adapted(self, scale: float, viewer: str = "") -> Adaptation:

@@ -34,7 +34,7 @@ from mipmap_plugin.adaptation.adapted import render_model
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.evaluation.metrics import psnr
-from mipmap_plugin.evaluation.protocols import TestView, test_views
+from mipmap_plugin.evaluation.protocols import TestView, photographed_views
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.splat_transform import TOOL, find_tool
 from mipmap_plugin.levels.manifest import MANIFEST
@@ -194,7 +194,7 @@ def changes(dolly: Dolly, ours: Show, viewer: str) -> list[Change]:
 def dolly_of(base: Wrapped, images: Path) -> Dolly:
     """The dolly, seen from test views with photographs where the images lie there, else from random views between the base's own."""
     if images.is_dir():
-        shots = test_views(base.place(load_scene(images)), base.cameras, base.background)[VIEWS]
+        shots = photographed_views(base, load_scene(images))[VIEWS]
         return Dolly(base, [shot.camera for shot in shots], shots)
     return Dolly(base, jittered(base.views(), RANDOM_VIEWS, torch.Generator().manual_seed(SEED)))
 

@@ -25,7 +25,7 @@ from PIL import Image, ImageDraw
 
 from mipmap_plugin import load_scene, wrap_model
 from mipmap_plugin.evaluation.metrics import psnr
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, TestView, test_views
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, TestView, photographed_views
 from mipmap_plugin.evaluation.report import markdown
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.wrap import Wrapped
@@ -148,7 +148,7 @@ def main(
     pictures.mkdir(parents=True, exist_ok=True)
     for base in only or BASES:
         wrapped = wrap_model(data / "checkpoints" / "bases" / base)
-        views = test_views(wrapped.place(load_scene(data / "images" / base.split("_")[0])), wrapped.cameras, wrapped.background)[VIEWS]
+        views = photographed_views(wrapped, load_scene(data / "images" / base.split("_")[0]))[VIEWS]
         for at in scale or SCALES:
             with tempfile.TemporaryDirectory() as folder, Browser() as browser:
                 work = Work(wrapped, at, Path(folder))

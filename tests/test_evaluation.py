@@ -187,8 +187,7 @@ def test_beyond_the_limit_photographs_are_read_again(scene, monkeypatch):
     reads, image = [], type(scene).image
     monkeypatch.setattr(type(scene), "image", lambda self, camera, background: reads.append(camera) or image(self, camera, background))
     first, second = [*scene.images][:2]
-    held = photographs.Photographs(scene, (0.0, 0.0, 0.0), most_bytes=24 * 32 * 3)
-    of_first, of_second = held.of(first), held.of(second)
+    of_first, of_second = photographs.kept_photographs(scene, (first, second), (0.0, 0.0, 0.0), most_bytes=24 * 32 * 3)
     assert torch.equal(of_first(), image(scene, first, (0.0, 0.0, 0.0))) and torch.equal(of_second(), image(scene, second, (0.0, 0.0, 0.0)))
     assert reads == [first, second, second]
 

@@ -9,7 +9,7 @@ import torch
 from tiny import cameras
 
 from mipmap_plugin.adaptation.optimization.density import ScreenGradients
-from mipmap_plugin.adaptation.start.pixel_size import pixel_size
+from mipmap_plugin.adaptation.pixel_size import pixel_size
 from mipmap_plugin.models.mip import filter_3d_of
 
 # World units. float32 knows places to 1/16 unit there, and rotation · point + translation to no better than 1/4.

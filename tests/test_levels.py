@@ -30,7 +30,7 @@ from mipmap_plugin.commands.ladders import print_summary
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import OutputError, OutputExists, SceneError, SettingsError
-from mipmap_plugin.evaluation.tradeoff.points import on_backend
+from mipmap_plugin.evaluation.tradeoff.measuring import on_backend
 from mipmap_plugin.levels.contents import Contents, LeftOut, Level
 from mipmap_plugin.levels.ladder import MORE_SPLATS, NOT_BETTER, UNSHOWN, _no_use, _shown, make_levels
 from mipmap_plugin.levels.manifest import MANIFEST, base_pixel, write_ladder

@@ -12,7 +12,7 @@ import torch
 
 from mipmap_plugin import cli, load_model, wrap_model
 from mipmap_plugin.adaptation.optimization.validation import Validation
-from mipmap_plugin.adaptation.start.pixel_size import pixel_size, seen_pixel_size
+from mipmap_plugin.adaptation.pixel_size import pixel_size, seen_pixel_size
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.commands.levels import print_summary

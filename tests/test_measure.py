@@ -19,7 +19,8 @@ from mipmap_plugin.evaluation import protocols
 from mipmap_plugin.evaluation.evaluate import Evaluator, training_free_rows
 from mipmap_plugin.evaluation.measure import baselines, resized_base, views_seen, warm_stopwatch, warm_up
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol
-from mipmap_plugin.evaluation.tradeoff.points import Plan, measure
+from mipmap_plugin.evaluation.tradeoff.measuring import measure
+from mipmap_plugin.evaluation.tradeoff.points import Plan
 from mipmap_plugin.evaluation.tradeoff.truth import photographs
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel

@@ -17,10 +17,10 @@ import torch_checkpoints
 from mipmap_plugin import load_model, load_scene, wrap_model
 from mipmap_plugin.adaptation.optimization import run
 from mipmap_plugin.adaptation.optimization.validation import Validation
+from mipmap_plugin.adaptation.pixel_size import mean_pixel_size
 from mipmap_plugin.adaptation.start import merging
 from mipmap_plugin.adaptation.start.blend_weights import may_show
 from mipmap_plugin.adaptation.start.closed_form import closed_form
-from mipmap_plugin.adaptation.start.pixel_size import mean_pixel_size
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
 from mipmap_plugin.adaptation.views import remarks, showing
@@ -69,8 +69,8 @@ FAMILIES = {
 
 @pytest.mark.parametrize(("family", "scale"), [*((family, 1 / 2) for family in FAMILIES), ("3dgs", 2), ("2dgs", 2)])
 def test_each_family_adapts_and_is_saved_there(family, scale, tmp_path, monkeypatch):
-    for compiled in ("closed_form.summed_areas", "pixel_size.finest_pixels"):  # which are a little more exact
-        monkeypatch.setattr(f"mipmap_plugin.adaptation.start.{compiled}", lambda *_: None)
+    for compiled in ("start.closed_form.summed_areas", "pixel_size.finest_pixels"):  # which are a little more exact
+        monkeypatch.setattr(f"mipmap_plugin.adaptation.{compiled}", lambda *_: None)
     model = load_model(FAMILIES[family](tmp_path / "base"))
     settings = dict(FEW, steps=2 if family == "3dgs" else 1, prune_every=1, check_every=1)
     settings["merge_to"] = 0.5 if (family, scale) == ("3dgs", 1 / 2) else 1.0

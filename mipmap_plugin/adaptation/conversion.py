@@ -77,7 +77,7 @@ class Stages:
         if first is None:
             return Session(self.request, scale, config, cameras, self.photographs).run(self.resume, self.observe)
         session = Session(self.request, 1.0, first, cameras, None)
-        session.keeps_state, session.wanted = True, scale
+        session.wanted = scale
         converted = replace(session.run(self.resume and conversion_state(self.resume), self.observe), judge=None)  # which nobody saves
         stopped = session.ended is End.OBSERVER
         del session  # with the truths of its views

@@ -72,9 +72,3 @@ def decibel(mean_square: float) -> float:
 def psnr_as_shown(image: torch.Tensor, truth: torch.Tensor) -> float:
     """PSNR (dB) of two images, clamped to 0..1 as a display does. On their own device, and quicker than the metric of evaluations."""
     return decibel(float((image.clamp(0, 1) - truth.clamp(0, 1)).square().mean()))
-
-
-def is_true(answer: object) -> bool:
-    """Whether an observer's answer is True: Python's, NumPy's or torch's."""
-    kind = answer is True or str(getattr(answer, "dtype", "")) in ("bool", "torch.bool")
-    return kind and getattr(answer, "shape", ()) == () and bool(answer)

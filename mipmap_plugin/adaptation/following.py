@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from mipmap_plugin.adaptation.start.pixel_size import pixel_size
+from mipmap_plugin.adaptation.pixel_size import pixel_size
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.models.base import SplatModel
 

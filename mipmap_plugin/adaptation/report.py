@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -10,9 +10,10 @@ import torch
 from pydantic import BaseModel, ConfigDict
 
 from mipmap_plugin.adaptation.curve import CurvePoint
+from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.effects import Effect, Effects, enlarges
-from mipmap_plugin.models.base import SPLATS, SplatModel
+from mipmap_plugin.effects import Effect, Effects, enlarges, explain
+from mipmap_plugin.models.base import SPLATS, SplatModel, effects_of
 from mipmap_plugin.scenes.orbits import Orbit
 
 # The name of the base among a run's states.
@@ -140,6 +141,13 @@ def filters(scale: float, config: AdaptConfig, base: Effects, files: Sequence[Ef
         truth += f", and {config.upsampler} fused with it" if config.compare_at == "both" else ""
     base_filter, *file_filters = (f"{effects.screen_filter} {effects.eps2d:g} px²" for effects in (base, *files))
     return f"pseudo truth {truth}; base {base_filter}; file {', '.join(dict.fromkeys(file_filters))}"
+
+
+def simulated(base: SplatModel, view: Camera, targets: Iterable[Effects], config: AdaptConfig, scale: float) -> list[Effect]:
+    """Every effect of adapting a base and of rendering its file; it is on where it is on in any of the `targets`."""
+    gaussians, own = base.gaussians(view), effects_of(base)
+    per_target = [explain(target, gaussians, own, config, scale) for target in targets]
+    return [next((effect for effect in same if effect.on), same[0]) for same in zip(*per_target, strict=True)]
 
 
 def changes(base: SplatModel, adapted: SplatModel) -> list[str]:

@@ -19,6 +19,12 @@ from mipmap_plugin.models.base import SplatModel
 Observer = Callable[[int, float, Callable[[Camera], Tensor]], object]
 
 
+def ends_run(answer: object) -> bool:
+    """Whether an observer's answer is True: Python's, NumPy's or torch's."""
+    kind = answer is True or str(getattr(answer, "dtype", "")) in ("bool", "torch.bool")
+    return kind and getattr(answer, "shape", ()) == () and bool(answer)
+
+
 @dataclass(frozen=True)
 class AdaptationRequest:
     """What is adapted, for which viewers, and by which backend."""

@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from mipmap_plugin.adaptation.adapted import Adapted
-from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, is_true
+from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch
 from mipmap_plugin.adaptation.following import Following, release
 from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_trained, psnr_per_viewer
 from mipmap_plugin.adaptation.moments import at_their_moments, evaluate_moments
@@ -25,8 +25,8 @@ from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Quality, Validation, split_validation
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, unrounded, views_renderer
-from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, versions
-from mipmap_plugin.adaptation.request import AdaptationRequest, Observer
+from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, simulated, versions
+from mipmap_plugin.adaptation.request import AdaptationRequest, Observer, ends_run
 from mipmap_plugin.adaptation.start.candidates import UNMATCHED, StartSearch
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
 from mipmap_plugin.adaptation.start.problem import StartProblem
@@ -39,8 +39,7 @@ from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.effects import Effect, explain
-from mipmap_plugin.models.base import SplatModel, count_of, digest_of_model, digest_of_parameters, effects_of
+from mipmap_plugin.models.base import SplatModel, count_of, digest_of_model, digest_of_parameters
 from mipmap_plugin.models.health import doubts_in
 from mipmap_plugin.process import pool, threads
 from mipmap_plugin.process.clock import now
@@ -55,18 +54,15 @@ class Session:
 
     notes: Sequence[str] = ()  # on what the views show of the base
     ended: End | None = None  # why the steps ended
-    wanted: float | None = None  # the scale that is wanted in the end, where this is the conversion before
-    keeps_state = False  # whether the state of a run that has ended is kept too: because another one starts from what it returns
+    state: StateFile | None = None  # of the run, as long as its model is not saved
+    wanted: float | None = None  # where this is a conversion: the scale of the zoom-in that starts from what it returns; so its state is kept
 
     def __init__(self, request: AdaptationRequest, scale: float, config: AdaptConfig, cameras: list[Camera], real: Photographs | None) -> None:
+        self.request, self.scale, self.targets, self.finer = request, scale, request.targets, request.finer
         self.base, self.backend, self.base_effects = request.images.model, request.images.backend, request.images.effects
-        self.targets, self.has_gradients, self.backend_note = request.targets, request.has_gradients, request.backend_note
-        self.effects = next(iter(self.targets.values()))
-        self.extremes, self.start_target = extreme_targets(self.targets), median_target(self.targets)
-        asked, near = fitting(config, self.base_effects), self.effects.near_plane
-        self.asked, config = asked, affordable_for_model(asked, self.base, cameras, near)
-        self.scale, self.config, self.viewer, self._base_in_viewer = scale, config, request.viewer, request.base_in_viewer
-        self.finer, self.inputs, self.budget_share = request.finer, dict(request.inputs), request.budget_share
+        self.effects, self.extremes = next(iter(self.targets.values())), extreme_targets(self.targets)
+        self.asked = fitting(config, self.base_effects)
+        self.config = config = affordable_for_model(self.asked, self.base, cameras, self.effects.near_plane)
         self.device, self.viewpoints = self.base.parameters()["means"].device, request.viewpoints
         self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.device)
         self._has_photographs, self._orbits = real is not None, not cameras or config.views == "orbit"
@@ -81,7 +77,6 @@ class Session:
         if self.detail is not None:
             self.views = evenly(self.views, config.upsampled_views)
             self.views_note += f", {len(self.views)} of them upsampled"
-        self.state: StateFile | None = None
         truth = PseudoTruth(request.images, scale, config.model_copy(update=COMPARED_WITH_BASE if scale > 1 else {}))
         first, *further = [Renderer(self.backend, target) for target in self.extremes.values()]
         self.validation = Validation(steering, choosing, scale, truth, first, config.resize, further)
@@ -101,24 +96,20 @@ class Session:
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
         """Adapt the base, or continue the run that `resume` holds, and return the best state."""
-        near, few = self.base_effects.near_plane, len(self.base.parameters()["means"]) <= (self.config.most_splats or sys.maxsize)
+        near = self.base_effects.near_plane
         refuse_blind(self.base_views, self.base, near, self.truth, self.wanted or self.scale)
-        if self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values()):
+        if self._base_is_right:
             copy, reason = self._for_target(self.base), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
         for remark in filter(None, [*remarks(self.base_views, self.base, near, orbit=self._orbits), too_unlike(self.base_views)]):
             warn(remark)
         began = now(self.device)
-        with self.phase("compilation"):
-            merging, effects = self.config.merge_to < 1 and self._has_blend_weights, (self.base_effects, *self.targets.values())
-            takes_steps, by_rows = self._takes_steps, self.base.traits.plain and self.config.densify_gradient is None
-            calls = calls_of(self.views, self.scale, self.config.views_per_step, gradients=takes_steps, merging=merging, by_rows=by_rows)
-            warm_up(self.backend, self.base.gaussians(self.views[0]), effects, calls)
+        self._compile()
         evaluate_moments(self.base, [*self.views, *self.validation.steering], self.phase)
         search = StartSearch(self._start_problem())
         initial, start = search.best()
         self.notes = [note for note in search.notes if note == UNMATCHED or not (self.finer and self.finer.told)]
-        states = {AS_IT_IS: self._for_target(self._base_in_viewer, shared=True), f"the start, {start}": initial}
+        states = {AS_IT_IS: self._for_target(self.request.base_in_viewer, shared=True), f"the start, {start}": initial}
         curve: list[CurvePoint] = []
         ended_by = "0 steps" + fewer_note(self.asked.steps, self.config.model_copy(update={"steps": 0}))
         pool.release_to_system()
@@ -128,10 +119,18 @@ class Session:
             curve, states = run.curve, states | run.states(initial)
         return self._select(states, curve, ended_by)
 
+    def _compile(self) -> None:
+        """Let the backend compile what the run will call, in a phase of its own."""
+        merging, effects = self.config.merge_to < 1 and self._has_blend_weights, (self.base_effects, *self.targets.values())
+        takes_steps, by_rows = self._takes_steps, self.base.traits.plain and self.config.densify_gradient is None
+        with self.phase("compilation"):
+            calls = calls_of(self.views, self.scale, self.config.views_per_step, gradients=takes_steps, merging=merging, by_rows=by_rows)
+            warm_up(self.backend, self.base.gaussians(self.views[0]), effects, calls)
+
     def _start_problem(self) -> StartProblem:
         from_base = StartProblem(
             lambda: self._for_target(self.base, shared=True), self.base_views, self._closest_of, self.scale, self.base_effects,
-            self.start_target, self.config, self.backend, self._has_blend_weights, self.quality, self.phase,
+            median_target(self.targets), self.config, self.backend, self._has_blend_weights, self.quality, self.phase,
             may_lose=self.config.merging_costs if len(self.targets) > 1 and self.config.steps else 0.0,
         )  # fmt: skip
         if (finer := self.finer) is None:
@@ -140,8 +139,8 @@ class Session:
 
     def _select(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str) -> Adapted:
         """Return the best of the states on views that did not steer the run, or the last where the settings say so."""
-        began, most = now(self.device), self.config.most_splats or sys.maxsize
-        allowed = [name for name, model in states.items() if len(model.parameters()["means"]) <= most]
+        began = now(self.device)
+        allowed = [name for name, model in states.items() if len(model.parameters()["means"]) <= self._most_splats]
         (base, start, *_), last = states, allowed[-1]
         with self.phase("validation"):
             best, psnrs = self.validation.choose(states, allowed)
@@ -159,15 +158,20 @@ class Session:
         model = states[best].copy() if getattr(states[best], "shares", False) else states[best]
         return Adapted(model, report, self.backend, self.effects, self.targets, files, used, judge=self.validation.kept())
 
+    def _task(self, student: SplatModel, first: Renderer, further: Sequence[Renderer]) -> Task:
+        """What is optimized from `student` on: up to how many splats, and by which of the ways to draw them that the backend has."""
+        growth, targets = self.config.most_growth, [renderer.effects for renderer in (first, *further)]
+        return Task(
+            self.views, self.scale, self.truth, first, self.effects.background == (1.0, 1.0, 1.0), self.validation, self.detail,
+            max_splats=self._most_splats if growth is None else min(self._most_splats, int(growth * len(student.parameters()["means"]))),
+            further_renders=further, render_views=views_renderer(self.backend, targets),
+            render_to_step=SteppingRenderer.of(self.backend, targets), follow=Following(self.base, self.views, self.scale),
+        )  # fmt: skip
+
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
         """Run Algorithm 1 on `student`, or continue it from the state in `resume`; return the run and what ended it."""
-        max_splats = sys.maxsize if self.config.most_growth is None else int(self.config.most_growth * len(student.parameters()["means"]))
-        max_splats = min(max_splats, self.config.most_splats or sys.maxsize)
-        targets = [unrounded(target) for target in self.extremes.values()]
-        first, *further = [Renderer(self.backend, target) for target in targets]
-        together, stepping = views_renderer(self.backend, targets), SteppingRenderer.of(self.backend, targets)
-        white, follow = self.effects.background == (1.0, 1.0, 1.0), Following(self.base, self.views, self.scale)
-        task = Task(self.views, self.scale, self.truth, first, white, self.validation, self.detail, max_splats, further, together, stepping, follow)
+        first, *further = [Renderer(self.backend, unrounded(target)) for target in self.extremes.values()]
+        task = self._task(student, first, further)
         keeper = StateKeeper(resume, self._fingerprint())
         if not any(target.sh_degree for target in self.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no viewer evaluates view-dependent color, so that these coefficients need no gradient
@@ -180,7 +184,7 @@ class Session:
         def after_step(run: Run) -> bool:
             keeper.save_if_due(run)
             try:
-                return is_true(observe and observe(run.step, run.watch.seconds, first.of_model(run.student)))
+                return ends_run(observe and observe(run.step, run.watch.seconds, first.of_model(run.student)))
             except KeyboardInterrupt:  # as between two steps
                 keeper.save_and_stop(run)
 
@@ -188,7 +192,7 @@ class Session:
             task, config = within_budget(run, task, self.config)
             run.ended_by = adapt(run, task, config, keeper.save_and_stop, after_step)
             release(run.student)
-        if self.keeps_state:
+        if self.wanted is not None:
             keeper.save(run)
         run.optimizer.state.clear()
         pool.release_to_system()
@@ -197,9 +201,10 @@ class Session:
         self.seconds["validation"] = self.seconds.get("validation", 0.0) + checks
         self.seconds["optimization"] = run.watch.seconds - self.seconds["total"] - run.costs.seconds()
         self.seconds["total"] = run.watch.seconds
-        self.notes = [*self.notes, *([] if self.keeps_state else no_steps_notes(run, self.config, self.budget_share))]
+        share = self.request.budget_share
+        self.notes = [*self.notes, *(no_steps_notes(run, self.config, share) if self.wanted is None else [])]
         self.ended = run.ended_by
-        told = run.ended_by.told(self.config, run.step, self.budget_share)
+        told = run.ended_by.told(self.config, run.step, share)
         return run, told + (plan_note(run, self.config) or fewer_note(self.asked.steps, self.config)) + growth_note(run)
 
     def _for_target(self, model: SplatModel, *, shared: bool = False) -> SplatModel:
@@ -222,12 +227,22 @@ class Session:
             return self.validation.quality(model)
 
     @property
+    def _base_is_right(self) -> bool:
+        """Whether the base is the answer as it is: at its own scale, where it is drawn as in its training, and no splats are too many."""
+        few = len(self.base.parameters()["means"]) <= self._most_splats
+        return self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values())
+
+    @property
+    def _most_splats(self) -> int:
+        return self.config.most_splats or sys.maxsize
+
+    @property
     def _takes_steps(self) -> bool:
         return self._has_photographs or takes_steps(self.config, self.scale, self.base_effects, self.targets.values())
 
     @property
     def _has_blend_weights(self) -> bool:
-        return self.has_gradients and self.base.traits.same_for_all_views
+        return self.request.has_gradients and self.base.traits.same_for_all_views
 
     def _fingerprint(self) -> str:
         """A hash of everything that a run depends on, so that a state is never resumed as another run."""
@@ -235,19 +250,13 @@ class Session:
         targets = [asdict(target) for target in self.targets.values()]
         base += "" if self.finer is None else digest_of_parameters(self.finer.model)
         settings, views = self.config.model_dump(), digest_of(self.views)
-        facts = [base, self.inputs, self.scale, settings, self.backend.name, asdict(self.base_effects), targets, views]
+        facts = [base, dict(self.request.inputs), self.scale, settings, self.backend.name, asdict(self.base_effects), targets, views]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
-
-    def _effects(self) -> list[Effect]:
-        """Every effect; it is on where it is on in any viewer that the file is made for."""
-        gaussians, model_effects = self.base.gaussians(self.views[0]), effects_of(self.base)
-        per_viewer = [explain(target, gaussians, model_effects, self.config, self.scale) for target in self.targets.values()]
-        return [next((effect for effect in same if effect.on), same[0]) for same in zip(*per_viewer, strict=True)]
 
     def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str, returned: str, validation: dict[str, float]) -> Report:
         known = [*self.base.notes, *(self.finer.model.notes if self.finer else ())]
         notes = [*self.notes, *(note for note in student.notes if note not in known)]
-        as_trained = psnr_as_trained(self.validation, self.backend, self.targets, self.base, self.base_effects) if validation else None
+        as_trained = psnr_as_trained(self.validation, self.backend, self.targets, self.base, self.base_effects)
         shown = next((psnr for state, psnr in validation.items() if returned.startswith(state)), 0.0)
         notes += better_as_trained(as_trained, shown, self.base_effects)
         for note in notes:
@@ -256,11 +265,11 @@ class Session:
             scale=self.scale,
             base=digest_of_model(self.base),
             settings=self.config.model_copy(update={"validation_views": self.asked.validation_views}),  # which a time budget bounds
-            backend=self.backend_note,
+            backend=self.request.backend_note,
             views=self.views_note,
-            viewer=self.viewer,
+            viewer=self.request.viewer,
             filters=filters(self.scale, self.config, self.base_effects, list(self.targets.values())),
-            effects=self._effects(),
+            effects=simulated(self.base, self.views[0], self.targets.values(), self.config, self.scale),
             gaussians_before=len(self.base.gaussians(self.views[0])),
             gaussians_after=len(student.gaussians(self.views[0])),
             seconds=self.seconds,
@@ -272,7 +281,7 @@ class Session:
             peak_memory_mib=self.peak.mib(),
             curve=curve,
             versions=versions(),
-            inputs=self.inputs,
+            inputs=dict(self.request.inputs),
             orbit=self.viewpoints.orbit,
             notes=[*doubts_in(self.base.notes), *notes, *changes(self.base, student)],
         )

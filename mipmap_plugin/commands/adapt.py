@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from mipmap_plugin.models.base import SplatModel
     from mipmap_plugin.wrap import Wrapped
 
+File = tuple[float, str | None, Path]  # its scale, the viewer that it is for, and where it is written
+
 
 @dataclass(frozen=True)
 class Changes:
@@ -94,10 +96,10 @@ def adapt(
     wrapped = wrap(Base(checkpoint, cameras, background, backend, screen_filter, up), threads)
     most = _most(wrapped, splats, bytes, adapted_path(checkpoint, output, 1.0, several=False), (scale, viewer), settings)
     settings, requests = settings | without_none(most_splats=most), _requests(scale or _fitting(wrapped.model, most), viewer)
-    targets = [adapted_path(checkpoint, output, *request, several=len(requests) > 1) for request in requests]
-    _check(wrapped, requests, targets, settings, overwrite)
-    page = AdaptationPage(checkpoint, targets, overwrite) if report else None
-    models = _adapted(wrapped, requests, targets, settings | dict(images=images and scene(images)))
+    files = [(*request, adapted_path(checkpoint, output, *request, several=len(requests) > 1)) for request in requests]
+    _check(wrapped, files, settings, overwrite)
+    page = AdaptationPage(checkpoint, [target for *_, target in files], overwrite) if report else None
+    models = _adapted(wrapped, files, settings | dict(images=images and scene(images)))
     _save_all(wrapped, models, page, overwrite, json)
 
 
@@ -111,27 +113,24 @@ def _refuse_for_many(given: bool, scales: Sequence[float], size: str | None, pag
         raise SettingsError("--bytes and --report are for one checkpoint at a time, without tiles; leave them out, or adapt them one by one")
 
 
-def _check(
-    wrapped: Wrapped, requests: Sequence[tuple[float, str | None]], targets: Sequence[Path], settings: dict[str, Any], overwrite: bool
-) -> None:
+def _check(wrapped: Wrapped, files: Sequence[File], settings: dict[str, Any], overwrite: bool) -> None:
     """Raise now what adapting and saving would raise, as far as it can be predicted."""
+    targets = [target for *_, target in files]
     further = {name: value for name, value in settings.items() if name != "recipe"}
     if twice := [target for number, target in enumerate(targets) if target in targets[:number]]:
         raise SettingsError(f"two scales would both be written to {twice[0]}; give scales that differ more, or adapt to them one by one")
-    for (scale, viewer), target in zip(requests, targets, strict=True):
+    for scale, viewer, target in files:
         config = make_config(settings["recipe"], scale, **further)
         wrapped.targets(viewer)
         wrapped.refuse_output(target, overwrite=overwrite, networks_move=config.steps > 0 and config.rates.networks > 0, viewer=viewer)
 
 
-def _adapted(
-    wrapped: Wrapped, requests: Sequence[tuple[float, str | None]], targets: Sequence[Path], settings: dict[str, Any]
-) -> Iterator[tuple[Adapted, Path]]:
+def _adapted(wrapped: Wrapped, files: Sequence[File], settings: dict[str, Any]) -> Iterator[tuple[Adapted, Path]]:
     """Yield each model as soon as it is adapted, and the path to save it to."""
     from mipmap_plugin.models.places import state_path
 
-    wrapped.keeps_images = len(requests) > 1
-    for (scale, viewer), target in zip(requests, targets, strict=True):
+    wrapped.keeps_images = len(files) > 1
+    for scale, viewer, target in files:
         yield wrapped.adapt(scale, viewer=viewer, resume=state_path(target), **settings), target
 
 

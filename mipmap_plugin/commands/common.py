@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 import warnings
-from collections.abc import Sequence
 from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +14,6 @@ from mipmap_plugin.process.garbage import leave_loaded, uncollected
 from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
-    from mipmap_plugin.camera import Camera
     from mipmap_plugin.jobs.base import Base
     from mipmap_plugin.scenes import Scene
     from mipmap_plugin.wrap import Wrapped
@@ -67,15 +65,6 @@ def scene(path: Path) -> Scene:
 def without_none(**options: Any) -> dict[str, Any]:
     """The options that are not None."""
     return {name: value for name, value in options.items() if value is not None}
-
-
-def summary(cameras: Sequence[Camera], unread: Path | None) -> str:
-    """Describe cameras in a sentence. `unread`: the file beside a lone file (`unread_cameras`)."""
-    from mipmap_plugin.scenes.base import sizes_of  # here, for it imports torch
-
-    if not cameras:
-        return f"none are read; {unread} may be of this scene" if unread else "none beside the checkpoint"
-    return f"{len(cameras)}, {sizes_of(cameras)}, {sum(c.split == 'test' for c in cameras)} of them test views"
 
 
 def print_facts(facts: Any, as_json: bool) -> None:

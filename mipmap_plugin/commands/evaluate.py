@@ -105,6 +105,7 @@ class _Results:
         """Add the rows and notes of one checkpoint."""
         from mipmap_plugin.evaluation import evaluate as evaluation
         from mipmap_plugin.evaluation.cells import Cells
+        from mipmap_plugin.evaluation.notes import notes
 
         lpips = self._perceptual and self._perceptual.label
         asked = {"protocol": self._protocol, "lpips": lpips, "appearance": appearance, "settings": settings, "page": self._page is not None}
@@ -114,8 +115,7 @@ class _Results:
         gallery = evaluation_gallery(wrapped, self._protocol, len(judge.views), recipes) if self._page else None
         judge = replace(judge, watcher=gallery)
         self._rows += evaluation.all_rows(wrapped, judge, self._scales, recipes, **settings)
-        notes = [*judge.notes, *evaluation.notes(wrapped, self._scales, appearance)]
-        self._notes |= dict.fromkeys(notes + evaluation.other_filters(judge.protocol, self._scales, recipes, settings))
+        self._notes |= dict.fromkeys(notes(wrapped, judge, self._scales, recipes, settings, appearance))
         self.judged.append(len(judge.views))
         self._galleries.append(gallery)
 

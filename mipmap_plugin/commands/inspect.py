@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mipmap_plugin.commands.common import base_cameras, print_facts, summary
+from mipmap_plugin.commands.common import base_cameras, print_facts
 from mipmap_plugin.commands.types import Cameras, Checkpoint, ScreenFilter, Up
 from mipmap_plugin.process.garbage import uncollected
 from mipmap_plugin.progress import announced
@@ -70,10 +70,8 @@ def _facts(checkpoint: Path, wrapped: Wrapped, given: Path | None, *, whole: boo
     from mipmap_plugin.models.base import effects_of
     from mipmap_plugin.models.health import examine, holds_splats
     from mipmap_plugin.models.vanilla import VanillaModel
-    from mipmap_plugin.scenes import unread_cameras
 
-    model, place = wrapped.model, base_cameras(wrapped, given)
-    orbit = f"; it is looked at {wrapped.viewpoints.orbit.told()}" if not wrapped.cameras and wrapped.viewpoints.orbit.up else ""
+    model = wrapped.model
     with announced("examining"):
         gaussians = model.gaussians(wrapped.views()[0])
         health = examine(model if holds_splats(model) else VanillaModel.from_gaussians(gaussians, model.trained))
@@ -85,10 +83,24 @@ def _facts(checkpoint: Path, wrapped: Wrapped, given: Path | None, *, whole: boo
         "splats": len(gaussians),
         "sh degree": f"{gaussians.used_sh_degree()} in use of {gaussians.sh_degree}",
         "trained with": f"{wrapped.trained.screen_filter}, {wrapped.trained.eps2d:g} px², background {wrapped.background}",
-        "cameras": summary(wrapped.cameras, unread_cameras(model.source)) + (f", of its base, in {place}" if place else "") + orbit,
+        "cameras": _seen_by(wrapped, given),
         "effects": [str(effect) for effect in effects if effect.on or whole] + _off(effects, shown=whole),
         "health": told or ["nothing found"],
     }
+
+
+def _seen_by(wrapped: Wrapped, given: Path | None) -> str:
+    """The cameras in words, or what a model without any is looked at from. `given`: where they lie."""
+    from mipmap_plugin.scenes import unread_cameras
+    from mipmap_plugin.scenes.base import sizes_of
+
+    if wrapped.cameras:
+        place, tests = base_cameras(wrapped, given), sum(camera.split == "test" for camera in wrapped.cameras)
+        own = f"{len(wrapped.cameras)}, {sizes_of(wrapped.cameras)}, {tests} of them test views"
+        return f"{own}, of its base, in {place}" if place else own
+    unread, orbit = unread_cameras(wrapped.model.source), wrapped.viewpoints.orbit
+    none = f"none are read; {unread} may be of this scene" if unread else "none beside the checkpoint"
+    return f"{none}; it is looked at {orbit.told()}" if orbit.up else none
 
 
 def _verdict(wrapped: Wrapped, advice: str, health: Sequence[str], spoilt: bool, unseen: str) -> str:

@@ -74,14 +74,14 @@ def tradeoff(
     from mipmap_plugin.evaluation.tradeoff.files import KEPT, Folder, refuse
     from mipmap_plugin.evaluation.tradeoff.points import Plan
     from mipmap_plugin.evaluation.tradeoff.run import run
-    refuse(output, picture, overwrite)
+    refuse(folder := Folder(output, picture, overwrite))
     page = tradeoff_page_path(output, overwrite) if report else None
     plan = Plan(recipe or ("default", "paper"), steps, backend or ("auto",), supersampling or (2, 4, 8), renderers, repeats, seed, viewer)
     base = Base(checkpoint, cameras, background, screen_filter=screen_filter, up=up)
     model, photographs = wrap(base, threads), scene(images) if images else None
     _check(model, plan, scale)
     with resumable(output / KEPT, "cell"):
-        tradeoffs = run(model, photographs, unique_scales(scale), plan, views, Folder(output, picture, overwrite))
+        tradeoffs = run(model, photographs, unique_scales(scale), plan, views, folder)
     _print(tradeoffs, write_tradeoff_page(page, checkpoint, model, tradeoffs, overwrite), json)
 
 

@@ -15,7 +15,6 @@ from tqdm import tqdm
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.cells import Cells
 from mipmap_plugin.evaluation.measure import (
     FILTERS,
@@ -32,9 +31,8 @@ from mipmap_plugin.evaluation.metrics import psnr, ssim
 from mipmap_plugin.evaluation.other_scene import of_another_scene
 from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.photographs import digest_of_image
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, not_exposed, test_views
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, photographed_views
 from mipmap_plugin.evaluation.shots import Recorder, Shot, Watcher
-from mipmap_plugin.models.base import SplatModel, effects_of
 from mipmap_plugin.recipes import most_steps
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
@@ -114,14 +112,13 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def training_free_rows(
-    model: Wrapped, judge: Evaluator, scale: float, upsampler: str = "bicubic", without: Sequence[str] = (), viewer: str | None = None
+    model: Wrapped, judge: Evaluator, scale: float, upsampler: str = "bicubic", filters: Sequence[str] = FILTERS, viewer: str | None = None
 ) -> list[Row]:
     """Rows of the base as it is and of all training-free improvements of it (`measure.baselines`).
 
-    `without`: filters to leave out. `viewer`: adds a row of the base as this viewer renders it.
+    `viewer`: adds a row of the base as this viewer renders it.
     """
     count = len(model.model.gaussians(model.any_camera()))
-    filters = [name for name in FILTERS if name not in without]
     found = baselines(model, scale, judge.protocol.shrink_by, filters=filters, upsampler=upsampler)
     in_viewers = [base_in_viewer(name, model, scale) for name in viewers_for(viewer)] if viewer else []
 
@@ -143,35 +140,6 @@ def shown_as(row: Row) -> tuple[str, str]:
     return name, f"{worst_of}{count}".removeprefix(", ")
 
 
-def notes(model: Wrapped, scales: Sequence[float], appearance: str = "mean") -> list[str]:
-    """Notes on missing rows, on exposures, and on the appearance of test views, in sentences."""
-    missing = {name: model.lacks(name) for name in FILTERS if any(scale != 1 for scale in scales)}
-    messages = [f"there is no row {name!r}, since {reason}" for name, reason in missing.items() if reason]
-    return messages + not_exposed(model.model) + _appearance_note(model.model, appearance)
-
-
-def other_filters(protocol: Protocol, scales: Sequence[float], recipes: Sequence[str], settings: dict[str, Any]) -> list[str]:
-    """Which recipes are adapted to images that another filter made smaller than the truth's, in a sentence. `settings`: as of `all_rows`."""
-    truth, used = protocol.shrink_by, dict[str, str]()
-    same = {"box": "area"}.get(truth, truth)  # means of whole blocks, and of any
-    for name, scale in product(recipes, scales):
-        config = _config(name, scale, settings)
-        if scale < 1 and most_steps(name, scale, config.steps) and config.resize not in (truth, same):
-            used[name] = config.resize
-    others = ", ".join(f"{name} ({own})" for name, own in used.items())
-    aimed = f"--resize {same} adapts to images that are made as the truth is"
-    return [f"{protocol.name} makes photographs smaller by another filter ({truth}) than base images are for {others}; {aimed}"] if others else []
-
-
-def _appearance_note(model: SplatModel, appearance: str) -> list[str]:
-    """The appearance of test views in a sentence, if the model has appearances; `appearance`: "mean" or "upstream"."""
-    if not any(effect.name == "appearance embedding" and effect.on for effect in effects_of(model)):
-        return []
-    if appearance == "upstream":
-        return ["test views have the appearance of the training view with the same number, as in the original, whatever that view looked like"]
-    return ["test views have the mean appearance of all training views; the original has that of the same number (--appearance upstream)"]
-
-
 def adapted_row(name: str, adapted: Adapted, judge: Evaluator) -> Row:
     """The row of an adapted model, rendered as the viewer that it is made for does; of several viewers, the worst."""
     report = adapted.report
@@ -190,11 +158,7 @@ def evaluator_of(
     model: Wrapped, scene: Scene, protocol: str, perceptual: Perceptual | None = None, cells: Cells | None = None
 ) -> Evaluator:
     """What compares a model with the photographs of its scene; `cells`: where finished rows are kept. Raises SettingsError."""
-    scene = model.place(scene)
-    if not model.cameras:
-        raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder, or its cameras (--cameras)")
-    views = test_views(scene, model.cameras, model.background)
-    return Evaluator(views, PROTOCOLS[protocol], perceptual, scene.source.name, cells=cells or Cells(), notes=scene.notes)
+    return Evaluator(photographed_views(model, scene), PROTOCOLS[protocol], perceptual, scene.source.name, cells=cells or Cells(), notes=scene.notes)
 
 
 def evaluate(
@@ -221,7 +185,7 @@ def all_rows(model: Wrapped, judge: Evaluator, scales: Sequence[float], recipes:
     viewer, rows = settings.get("viewer"), []
     model.targets(viewer)  # raise errors of the viewer, the recipes and the settings before any work
     for name, scale in product(recipes, scales):
-        _config(name, scale, settings)
+        config_of(name, scale, settings)
     model.refuse_undrawn([view.camera for view in judge.views], min(scales))
     if doubt := of_another_scene(model, judge.views, scales[0], judge.protocol):
         warnings.warn(doubt, stacklevel=2)
@@ -231,7 +195,7 @@ def all_rows(model: Wrapped, judge: Evaluator, scales: Sequence[float], recipes:
     return rows
 
 
-def _config(name: str, scale: float, settings: dict[str, Any]) -> AdaptConfig:
+def config_of(name: str, scale: float, settings: dict[str, Any]) -> AdaptConfig:
     """The settings of a recipe with those of `Wrapped.adapt` that belong to it. Raises SettingsError."""
     return make_config(name, scale, **{key: value for key, value in settings.items() if key in AdaptConfig.model_fields})
 

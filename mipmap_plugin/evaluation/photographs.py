@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -15,22 +16,20 @@ from mipmap_plugin.scenes import Scene
 MOST_BYTES = 2**30
 
 
-class Photographs:
-    """The photographs of a scene on one background."""
+def kept_photographs(
+    scene: Scene, cameras: Sequence[Camera], background: tuple[float, float, float], most_bytes: int = MOST_BYTES
+) -> list[Callable[[], Tensor]]:
+    """For each camera what returns its photograph as `Scene.image` does, bit for bit, whenever it is asked.
 
-    def __init__(self, scene: Scene, background: tuple[float, float, float], most_bytes: int = MOST_BYTES) -> None:
-        self._scene, self._background, self._left = scene, background, most_bytes
-
-    def of(self, camera: Camera) -> Callable[[], Tensor]:
-        """What returns the photograph of `camera` as `Scene.image` does, bit for bit, whenever it is asked.
-
-        It is read at once, so that a damaged file is found before anything is measured. Raises SceneError.
-        """
-        kept = packed(self._scene.image(camera, self._background))
-        if kept.nbytes > self._left:
-            return lambda: self._scene.image(camera, self._background)
-        self._left -= kept.nbytes
-        return lambda: unpacked(kept)
+    All are read at once, so that a damaged file is found before anything is measured. Raises SceneError.
+    """
+    found: list[Callable[[], Tensor]] = []
+    for camera in cameras:
+        kept = packed(scene.image(camera, background))
+        fits = kept.nbytes <= most_bytes
+        most_bytes -= kept.nbytes * fits
+        found.append(partial(unpacked, kept) if fits else partial(scene.image, camera, background))
+    return found
 
 
 def digest_of_image(image: Tensor) -> str:

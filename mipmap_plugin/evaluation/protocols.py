@@ -24,10 +24,11 @@ from mipmap_plugin.adaptation.target.photographs import at_density_of
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.evaluation.photographs import Photographs
+from mipmap_plugin.evaluation.photographs import kept_photographs
 from mipmap_plugin.formats.images import averaged_straight, has_alpha, image_size, pillow_bicubic, read_image, read_straight
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.scenes import Scene
+from mipmap_plugin.wrap import Wrapped
 
 # COLMAP scenes include smaller copies of their photographs: images_2, images_4, images_8 beside images.
 READY_MADE = re.compile(r"images(_\d+)?$")
@@ -136,6 +137,14 @@ def ready_made(photograph: Path, size: tuple[int, int]) -> Path:
     raise SettingsError(f"P4 needs {required}, but there is {available}; evaluate a scale that has one, or by P3")
 
 
+def photographed_views(model: Wrapped, scene: Scene) -> list[TestView]:
+    """`test_views` of the scene of a model. Raises SettingsError, too, if the model has no cameras and gets none of the scene."""
+    scene = model.place(scene)
+    if not model.cameras:
+        raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder, or its cameras (--cameras)")
+    return test_views(scene, model.cameras, model.background)
+
+
 def test_views(scene: Scene, base: Sequence[Camera], background: tuple[float, float, float]) -> list[TestView]:
     """The scene's test photographs (all, if none is marked as test), with their cameras at the pixel density of the cameras of the base.
 
@@ -145,14 +154,8 @@ def test_views(scene: Scene, base: Sequence[Camera], background: tuple[float, fl
     cameras = [c for c in cameras if c.split == "test"] or cameras
     if not cameras:
         raise SettingsError(f"{scene.source}: there are no photographs to compare with")
-
-    photographs = Photographs(scene, background)
-
-    def view(original: Camera, camera: Camera) -> TestView:
-        file = scene.images[original]
-        return TestView(camera, photographs.of(original), file, background, file in scene.lenses, has_alpha(file))
-
-    return [*map(view, cameras, at_density_of(cameras, base))]
+    views = zip(at_density_of(cameras, base), kept_photographs(scene, cameras, background), (scene.images[c] for c in cameras), strict=True)
+    return [TestView(camera, photograph, file, background, file in scene.lenses, has_alpha(file)) for camera, photograph, file in views]
 
 
 def not_exposed(model: SplatModel) -> list[str]:

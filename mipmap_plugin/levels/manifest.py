@@ -7,7 +7,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from mipmap_plugin.adaptation.start.pixel_size import pixel_size, seen_pixel_size
+from mipmap_plugin.adaptation.pixel_size import pixel_size, seen_pixel_size
 from mipmap_plugin.formats.atomic import new_folder, refuse_output, refuse_to_lose, refuse_unwritable, sha256, write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.frozen_base import FrozenBase

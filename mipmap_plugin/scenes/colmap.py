@@ -66,7 +66,7 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         cameras.append(camera)
         if exists:
             photographs[camera] = photograph
-    notes = _notes(cameras, photographs, folder, cfg) + ([note(lenses.values(), len(lenses))] if lenses else [])
+    notes = _notes(cameras, photographs, folder, cfg) + ([note(lenses.values())] if lenses else [])
     return Scene(tuple(cameras), photographs, path, notes, points=_points(model), lenses=lenses)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -61,10 +61,11 @@ class Lens:
         return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
 
 
-def note(lenses: Iterable[Lens], count: int) -> str:
-    """A note that the images of `lenses` are undistorted; `count`: how many cameras have such a lens."""
+def note(lenses: Collection[Lens]) -> str:
+    """A note that the images of cameras with these lenses are undistorted."""
     models = ", ".join(sorted({lens.model for lens in lenses}))
-    return f"{count} cameras have lenses that bend ({models}): they are taken as pinholes, and their photographs are undistorted to be looked at"
+    bent = f"{len(lenses)} cameras have lenses that bend ({models})"
+    return f"{bent}: they are taken as pinholes, and their photographs are undistorted to be looked at"
 
 
 def can_undistort() -> bool:

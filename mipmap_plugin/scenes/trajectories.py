@@ -13,8 +13,8 @@ from mipmap_plugin.camera import Camera, viewmat_of
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.scenes.orbits import Orbit
 
-# A generated view lies between a camera and one of its NEIGHBORS nearest, or beyond either end by up to this fraction of the way. With 4
-# neighbors and 0 beyond, views fill the gaps between cameras so poorly that lego's test views at x1/8 lose 0.8 dB.
+# A generated view lies between a camera and one of its NEIGHBORS nearest, or beyond either end by up to this fraction of the way: with fewer, and
+# none beyond, views fill the gaps between cameras poorly.
 NEIGHBORS = 16
 BEYOND = 0.25
 
@@ -34,8 +34,8 @@ CANDIDATES = 16
 # Sine of the angle below which the intersection of two lines of sight is undefined.
 PARALLEL = 1e-6
 
-# How far people move before a scene that a lone camera saw, as a fraction of the distance to its middle. Files for x1/4 from one camera of lego,
-# chair and flowers gain 4 to 10 dB so far to its side by such views (2 to 5 at half of that), and lose up to 0.7 at the camera's own place.
+# How far people move before a scene that a lone camera saw, as a fraction of the distance to its middle. Files for x1/4 gain 4 to 10 dB so far to
+# its side by such views, and lose up to 0.7 at the camera's own place.
 SWAY = 0.1
 
 # Cameras whose directions differ more see different content, and views halfway between them look where no camera did.

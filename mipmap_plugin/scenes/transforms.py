@@ -28,6 +28,8 @@ USUAL_TURN = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
 # Radians: a smaller angle of view is longer than any lens, and its tangent may underflow.
 MIN_ANGLE = 1e-9
 
+View = tuple[Camera, Path | None, Lens | None]  # a camera, its image if there is one, and its lens if that has to be undistorted
+
 
 def read_transforms(path: str | Path) -> Scene:
     """The scene of a folder with transforms files, or of one such file.
@@ -40,25 +42,23 @@ def read_transforms(path: str | Path) -> Scene:
         SceneError: no transforms file, no usable frame, a lens that is not perspective, or an entry that cannot be read.
     """
     path = Path(path)
-    cameras: list[Camera] = []
-    images: dict[Camera, Path] = {}
+    views: list[View] = []
     notes: list[str] = []
-    lenses: dict[Path, Lens] = {}
-    distorted: list[Lens] = []
-    for file, split in transforms_files(path):
-        views, absent = _read_file(file, split)
-        cameras += [camera for camera, _, _ in views]
-        images |= {camera: image for camera, image, _ in views if image}
-        lenses |= {image: lens for _, image, lens in views if image and lens}
-        distorted += [lens for _, _, lens in views if lens]
+    files = transforms_files(path)
+    for file, split in files:
+        found, absent = _read_file(file, split)
+        views += found
         if absent:
-            unsized = absent - sum(image is None for _, image, _ in views)
+            unsized = absent - sum(image is None for _, image, _ in found)
             notes.append(f"{file.name}: {_counted(absent)} {ABSENT}{_left_out(unsized)}")
-    if not cameras:
+    if not views:
         raise SceneError(f"{path}: none of the listed images is there, and the sizes are unknown; add the images, or w and h to the file")
-    first = transforms_files(path)[0][0]
-    notes += [note(distorted, len(distorted)) + ("" if can_undistort() else f"; pycolmap does that: {INSTALL}")] if distorted else []
-    return Scene(tuple(cameras), images, path, notes, applied=_applied(first), applied_scale=_applied_scale(first), lenses=lenses)
+    cameras, distorted = tuple(camera for camera, _, _ in views), [lens for _, _, lens in views if lens]
+    images = {camera: image for camera, image, _ in views if image}
+    lenses = {image: lens for _, image, lens in views if image and lens}
+    notes += [note(distorted) + ("" if can_undistort() else f"; pycolmap does that: {INSTALL}")] if distorted else []
+    applied, applied_scale = _applied(files[0][0])
+    return Scene(cameras, images, path, notes, applied=applied, applied_scale=applied_scale, lenses=lenses)
 
 
 def transforms_files(path: Path) -> list[tuple[Path, Literal["train", "test"]]]:
@@ -98,14 +98,14 @@ def _left_out(unsized: int) -> str:
     return f"; {cameras} left out because the file has no w and h"
 
 
-def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[tuple[Camera, Path | None, Lens | None]], int]:
-    """The usable cameras with their images and lenses that have to be undistorted, and the number of listed images that are missing."""
+def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View], int]:
+    """The usable views, and the number of listed images that are missing."""
     data = read_json(file)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
         lacks = "has no list of 'frames'" if frames != [] else "lists no frames"
         raise SceneError(f"{file}: {lacks}; give a NeRF-Synthetic, instant-ngp or nerfstudio transforms file")
-    views: list[tuple[Camera, Path | None, Lens | None]] = []
+    views: list[View] = []
     absent, trained = 0, data.get("train_filenames")
     for index, frame in enumerate(frames):
         where = f"{file}, frame {index}"
@@ -129,16 +129,14 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[tuple[
     return views, absent
 
 
-def _applied(file: Path) -> Tensor | None:
-    """nerfstudio's `applied_transform` [4, 4], which was applied to COLMAP's world already; old files do not record it."""
-    data = read_json(file)
-    if "applied_transform" not in data:
-        return _pose(USUAL_TURN, str(file)) if file.name == "transforms.json" and (file.parent / "colmap/sparse/0").exists() else None
-    return _pose(data["applied_transform"], f"{file}, applied_transform")
-
-
-def _applied_scale(file: Path) -> float:
-    return positive(read_json(file).get("applied_scale", 1.0), f"{file}, applied_scale")
+def _applied(file: Path) -> tuple[Tensor | None, float]:
+    """nerfstudio's `applied_transform` [4, 4] and its scale, which were applied to COLMAP's world already; old files record no transform."""
+    data, transform = read_json(file), None
+    if "applied_transform" in data:
+        transform = _pose(data["applied_transform"], f"{file}, applied_transform")
+    elif file.name == "transforms.json" and (file.parent / "colmap/sparse/0").exists():
+        transform = _pose(USUAL_TURN, str(file))
+    return transform, positive(data.get("applied_scale", 1.0), f"{file}, applied_scale")
 
 
 def _image(folder: Path, listed: str) -> Path | None:

@@ -8,7 +8,6 @@ with all of it is drawn exactly.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -35,10 +34,10 @@ LEAST, PAD = 1e-3, 8
 FINE = 255
 
 
-def draw_halos(scene: TiledScene, part: int, sweep: Sweep, folder: Path) -> None:
+def draw_halos(scene: TiledScene, part: int, sweep: Sweep) -> None:
     """Draw the `part`-th of a sweep's views as it begins, and write the picture, NAME, and what each tile TILE has in it around it, NAME/TILE."""
-    splats, painter = open_state(scene, folder, Steered.before(folder, sweep.number)), scene.painter(on_black(scene.target))
-    layers = [Album([layer_file(folder, number, sweep.halos)]) for number in range(len(scene.cores))]
+    splats, painter = open_state(scene, Steered.before(scene.folder, sweep.number)), scene.painter(on_black(scene.target))
+    layers = [Album([layer_file(scene.folder, number, sweep.halos)]) for number in range(len(scene.cores))]
     background = torch.tensor(scene.target.background)
 
     def pictures() -> Iterator[tuple[str, Tensor, Box | None]]:
@@ -47,7 +46,7 @@ def draw_halos(scene: TiledScene, part: int, sweep: Sweep, folder: Path) -> None
             for number, halo, box in _halos(scene, view, layers):
                 yield f"{view.name}/{number}", halo, box
 
-    write_pictures(halo_file(folder, part, sweep.halos), pictures())
+    write_pictures(halo_file(scene.folder, part, sweep.halos), pictures())
 
 
 def _halos(scene: TiledScene, view: Camera, layers: list[Album]) -> Iterator[tuple[int, Tensor, Box]]:
@@ -55,7 +54,7 @@ def _halos(scene: TiledScene, view: Camera, layers: list[Album]) -> Iterator[tup
     and the fraction of the pixel's blend weights that the tile has."""
     size = view.zoomed(scene.scale).size
     seen = [number for number in front_to_back(scene.tree, view.center.tolist()) if view.name in layers[number]]
-    boxes = {number: layers[number].entry(view.name).box or (0, 0, size[1], size[0]) for number in seen}
+    boxes = {number: layers[number].box(view.name) or (0, 0, size[1], size[0]) for number in seen}
     pictures = {number: layers[number][view.name].float() for number in seen}
     fronts, through = {}, torch.ones(*size, 1)
     for number in seen:

@@ -40,45 +40,44 @@ class TileJob(Job):
 
         scene = opened(self.base, self.scale, self.viewer, self.config(), self.target.parent)
         with thread_pool.limited_for(scene.backend, threads):
-            self._do(scene, self.target.parent)
+            self._do(scene)
         pool.release_to_system()
         return Outcome(self, "done", self.target, _facts(self.target))
 
-    def _do(self, scene: Any, folder: Path) -> None:
+    def _do(self, scene: Any) -> None:
         if self.work == "truth":
             from mipmap_plugin.tiles.truth import draw_truths
 
-            others = [(scene.at(job.scale, job.config()), work_folder(job.target)) for job in self.others]
-            draw_truths(scene, self.number, folder, others)
+            draw_truths(scene, self.number, [scene.at(job.scale, job.config(), work_folder(job.target)) for job in self.others])
         elif self.work == "start":
             from mipmap_plugin.tiles.start import StartSearch
 
-            StartSearch(scene, folder).run()
+            StartSearch(scene).run()
         elif self.work == "layer":
             from mipmap_plugin.tiles.layers import draw_layers
 
-            draw_layers(scene, self.number, self._sweep(scene, folder), folder)
+            draw_layers(scene, self.number, self._sweep(scene))
         elif self.work == "halo":
             from mipmap_plugin.tiles.halo import draw_halos
 
-            draw_halos(scene, self.number, self._sweep(scene, folder), folder)
+            draw_halos(scene, self.number, self._sweep(scene))
         elif self.work == "steering":
             from mipmap_plugin.tiles.steering import steer
 
-            steer(scene, self._sweep(scene, folder), folder)
+            steer(scene, self._sweep(scene))
         else:
-            self._adapt(scene, folder)
+            self._adapt(scene)
 
-    def _sweep(self, scene: Any, folder: Path) -> Any:
+    def _sweep(self, scene: Any) -> Any:
         from mipmap_plugin.tiles.steering import sweep_of
 
-        return sweep_of(scene, folder, self.sweep)
+        return sweep_of(scene, self.sweep)
 
-    def _adapt(self, scene: Any, folder: Path) -> None:
+    def _adapt(self, scene: Any) -> None:
         from mipmap_plugin.models.places import state_path
         from mipmap_plugin.tiles.tile import Tile
 
-        saved, facts, keeper = Tile(scene, self.number, self._sweep(scene, folder), folder).adapt(state_path(self.target))
+        saved, facts, keeper = Tile(scene, self.number, self._sweep(scene)).adapt(state_path(self.target))
         with together(self.target):
             save_torch(self.target, saved, overwrite=True)
             write_json(facts_file(self.target), facts, overwrite=True)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.tiles.folder import START
@@ -15,13 +13,13 @@ from mipmap_plugin.tiles.truth import Truths
 JOINED = "the joined tiles"
 
 
-def judged(scene: TiledScene, folder: Path) -> tuple[dict[str, float], str]:
+def judged(scene: TiledScene) -> tuple[dict[str, float], str]:
     """The PSNR (dB) of each on whole views, and the name of what is returned: the best, or the last where the settings say so."""
     if not scene.views.choosing:
         return {}, JOINED
-    truths, last = Truths(scene, folder), result(folder)
-    start = f"the start, {load_torch(folder / START)['name']}"
-    states = {AS_IT_IS: scene.base, start: open_state(scene, folder, Steered.before(folder, 0)), JOINED: open_state(scene, folder, last)}
+    truths, start = Truths(scene), f"the start, {load_torch(scene.folder / START)['name']}"
+    first, last = (open_state(scene, state) for state in (Steered.before(scene.folder, 0), result(scene.folder)))
+    states = {AS_IT_IS: scene.base, start: first, JOINED: last}
     psnrs = {name: psnr(scene, splats, truths, scene.views.choosing) for name, splats in states.items()}
     best = max(reversed(psnrs), key=psnrs.__getitem__)
     return psnrs, JOINED if scene.config.returns == "last" else best

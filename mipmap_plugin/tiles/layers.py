@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -26,9 +25,9 @@ def on_black(effects: Effects) -> Effects:
 
 
 @torch.no_grad()
-def draw_layers(scene: TiledScene, number: int, sweep: Sweep, folder: Path) -> None:
+def draw_layers(scene: TiledScene, number: int, sweep: Sweep) -> None:
     """Draw a tile in each of a sweep's views, and write [h, w, 4] half of each: the picture on black, and the transmittance."""
-    splats = scene.kind(Store(Steered.before(folder, sweep.number).file(folder, number)).parameters()).gaussians()
+    splats = scene.kind(Store(Steered.before(scene.folder, sweep.number).file(scene.folder, number)).parameters()).gaussians()
     effects = on_black(scene.target)
 
     def pictures() -> Iterator[tuple[str, Tensor, Box]]:
@@ -38,7 +37,7 @@ def draw_layers(scene: TiledScene, number: int, sweep: Sweep, folder: Path) -> N
                 layer = torch.cat([rendered.image, (1 - rendered.alpha)[..., None]], dim=2)
                 yield view.name, within(layer, box).half(), box
 
-    write_pictures(layer_file(folder, number, sweep.halos), pictures())
+    write_pictures(layer_file(scene.folder, number, sweep.halos), pictures())
 
 
 def box_of(shown: Tensor, pad: int = 0) -> Box | None:

@@ -24,37 +24,14 @@ Box = tuple[int, int, int, int]  # left, top, right, bottom, px of the view
 Picture = tuple[str, Tensor, Box | None]  # its name, and what it shows of its view; None: all
 
 
-class Entry(NamedTuple):
+class _Entry(NamedTuple):
     """One picture of a file."""
 
+    path: Path
     start: int  # byte
     shape: tuple[int, ...]
     kind: str  # of `KINDS`
     box: Box | None  # what it shows of its view; None: all
-
-
-class Pictures:
-    """The pictures of a file, by name."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        with path.open("rb") as file:
-            file.seek(-END.size, 2)
-            end = file.tell()
-            (start,) = END.unpack(file.read(END.size))
-            file.seek(start)
-            table = json.loads(file.read(end - start))
-        self.entries = {name: Entry(at, tuple(shape), kind, box and tuple(box)) for name, (at, shape, kind, box) in table.items()}
-
-    def __getitem__(self, name: str) -> Tensor:
-        """A picture, read anew each time."""
-        entry = self.entries[name]
-        kind = KINDS[entry.kind]
-        picture = torch.empty(entry.shape, dtype=kind)
-        with self._path.open("rb") as file:
-            file.seek(entry.start)
-            file.readinto(picture.view(-1).view(torch.uint8).numpy().data)
-        return picture
 
 
 def write_pictures(path: Path, pictures: Iterable[Picture]) -> None:
@@ -85,16 +62,31 @@ class Album:
     """The pictures of several files, by name."""
 
     def __init__(self, paths: Iterable[Path]) -> None:
-        files = [Pictures(path) for path in paths]
-        self._file_of = {name: file for file in files for name in file.entries}
+        self._entries = {name: entry for path in paths for name, entry in _table(path).items()}
 
     def __contains__(self, name: str) -> bool:
-        return name in self._file_of
+        return name in self._entries
 
     def __getitem__(self, name: str) -> Tensor:
         """A picture, read anew each time."""
-        return self._file_of[name][name]
+        entry = self._entries[name]
+        picture = torch.empty(entry.shape, dtype=KINDS[entry.kind])
+        with entry.path.open("rb") as file:
+            file.seek(entry.start)
+            file.readinto(picture.view(-1).view(torch.uint8).numpy().data)
+        return picture
 
-    def entry(self, name: str) -> Entry:
-        """What the table says of a picture."""
-        return self._file_of[name].entries[name]
+    def box(self, name: str) -> Box | None:
+        """What a picture shows of its view; None: all."""
+        return self._entries[name].box
+
+
+def _table(path: Path) -> dict[str, _Entry]:
+    """The pictures of a file, by name."""
+    with path.open("rb") as file:
+        file.seek(-END.size, 2)
+        end = file.tell()
+        (start,) = END.unpack(file.read(END.size))
+        file.seek(start)
+        table = json.loads(file.read(end - start))
+    return {name: _Entry(path, at, tuple(shape), kind, box and tuple(box)) for name, (at, shape, kind, box) in table.items()}

@@ -8,10 +8,8 @@ from pathlib import Path
 
 from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.adaptation.optimization.amount import fewer_note
-from mipmap_plugin.adaptation.report import Report, filters, versions
-from mipmap_plugin.effects import explain
+from mipmap_plugin.adaptation.report import Report, filters, simulated, versions
 from mipmap_plugin.formats.ply import read_header
-from mipmap_plugin.models.base import effects_of
 from mipmap_plugin.tiles.scene import TiledScene
 
 
@@ -20,7 +18,6 @@ def make_report(scene: TiledScene, files: Sequence[Path], seconds: dict[str, flo
     after = sum(read_header(file).vertex.count for file in files)
     model, config = scene.wrapped.model, scene.config
     large = fewer_note(scene.asked_steps, config)
-    effects = explain(scene.target, model.gaussians(scene.wrapped.any_camera()), effects_of(model), config, scene.scale)
     lost = [f"the extra columns {', '.join(scene.extras)} are dropped, since tiles hold none"] if scene.extras else []
     for note in lost:
         warnings.warn(note, stacklevel=2)
@@ -36,7 +33,7 @@ def make_report(scene: TiledScene, files: Sequence[Path], seconds: dict[str, flo
         views=f"{scene.views.note}, in {len(files)} tiles",
         viewer=scene.viewer,
         filters=filters(scene.scale, config, scene.base_effects, [scene.target]),
-        effects=list(effects),
+        effects=simulated(model, scene.wrapped.any_camera(), [scene.target], config, scene.scale),
         gaussians_before=sum(map(len, scene.cores)),
         gaussians_after=after,
         seconds=seconds,

@@ -85,18 +85,17 @@ def _opened(job: Job) -> TiledScene:
 
 def _adapted_and_saved(scene: TiledScene, stages: _Stages, began: float, threads: int | None) -> Joined:
     """Adapt a scene that is cut, and write it. `began`: when its time began to count."""
-    job, folder = stages.job, work_folder(stages.job.target)
-    facts = _adapted(scene, folder, stages)
+    facts = _adapted(scene, stages)
     last = time.perf_counter()
     with thread_pool.limited_for(scene.backend, threads):
-        validation, returned = judged(scene, folder)
+        validation, returned = judged(scene)
     stages.seconds["validation"] = time.perf_counter() - last
     stages.seconds["total"] = time.perf_counter() - began
-    files = _write_parts(scene, folder, returned)
+    files = _write_parts(scene, returned)
     report = make_report(scene, files, stages.seconds, validation, returned)
-    saved = _save(scene, job, files, Joined(job.target, report, facts))
+    saved = _save(scene, stages.job, files, Joined(stages.job.target, report, facts))
     close_opened()
-    shutil.rmtree(folder)
+    shutil.rmtree(scene.folder)
     return saved
 
 
@@ -123,13 +122,13 @@ class _Stages:
         return [outcome.report for outcome in sorted(outcomes, key=lambda outcome: outcome.job.number)]  # type: ignore[attr-defined]
 
 
-def _adapted(scene: TiledScene, folder: Path, do: _Stages) -> list[dict[str, Any]]:
+def _adapted(scene: TiledScene, do: _Stages) -> list[dict[str, Any]]:
     """Adapt all tiles; return what there is to say of each in each sweep."""
-    tiles = range(len(scene.cores))
+    tiles, folder = range(len(scene.cores)), scene.folder
     do("truth", [truth_file(folder, part) for part in range(parts(scene.used_views))])
     do("start", [folder / START])
     facts: list[dict[str, Any]] = []
-    sweep, number = sweep_of(scene, folder, 0), 0
+    sweep, number = sweep_of(scene, 0), 0
     while sweep is not None:
         runs = [run_file(folder, tile, number) for tile in tiles]
         if not sweep.repeats and not all(file.exists() for file in runs):
@@ -138,16 +137,17 @@ def _adapted(scene: TiledScene, folder: Path, do: _Stages) -> list[dict[str, Any
         facts += do("tile", runs, number)
         do("steering", [steered_file(folder, number)], number)
         number += 1
-        sweep, state = sweep_of(scene, folder, number), Steered.before(folder, number)
-        _forget(scene, folder, sweep, state, number)
+        sweep, state = sweep_of(scene, number), Steered.before(folder, number)
+        _forget(scene, sweep, state, number)
         if scene.config.target_db is not None and state.psnr >= scene.config.target_db:
             break
     return facts
 
 
-def _forget(scene: TiledScene, folder: Path, sweep: Sweep | None, state: Steered, made: int) -> None:
+def _forget(scene: TiledScene, sweep: Sweep | None, state: Steered, made: int) -> None:
     """Make room on the disk: of what `made` sweeps left, only what the next one, `sweep`, goes on with is needed."""
-    kept = {state.file(folder, tile) for tile in range(len(scene.cores))}
+    tiles, folder = range(len(scene.cores)), scene.folder
+    kept = {state.file(folder, tile) for tile in tiles}
     for number in range(made):  # and nothing of later sweeps, which an interrupted run has begun
         unneeded = {*folder.glob(f"tile_{number}_*.splats")} - kept
         if sweep is None or number < sweep.halos:
@@ -155,15 +155,15 @@ def _forget(scene: TiledScene, folder: Path, sweep: Sweep | None, state: Steered
         for file in unneeded:
             file.unlink()
     for number in set(range(made - 1)) - {state.sweep}:
-        for tile in range(len(scene.cores)):
+        for tile in tiles:
             run_file(folder, tile, number).write_bytes(b"")  # which still says that the tile was done
 
 
-def _write_parts(scene: TiledScene, folder: Path, returned: str) -> list[Path]:
+def _write_parts(scene: TiledScene, returned: str) -> list[Path]:
     """Write the splats of each tile to a PLY of its own."""
-    files = [part_file(folder, number) for number in range(len(scene.cores))]
-    state = result(folder) if returned == JOINED else Steered.before(folder, 0)
-    splats = scene.base if returned == AS_IT_IS else open_state(scene, folder, state)
+    files = [part_file(scene.folder, number) for number in range(len(scene.cores))]
+    state = result(scene.folder) if returned == JOINED else Steered.before(scene.folder, 0)
+    splats = scene.base if returned == AS_IT_IS else open_state(scene, state)
     cores = scene.cores if returned == AS_IT_IS else torch.arange(len(splats)).split([*map(len, splats.parts)])
     for file, core in zip(files, cores, strict=True):
         for_loader_of(scene.viewer, scene.for_target(splats.parameters(core)), file).save(file, provenance={}, overwrite=True)

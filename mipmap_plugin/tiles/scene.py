@@ -55,8 +55,8 @@ class TiledScene:
     """A scene and its cores."""
 
     def __init__(self, base: Base, scale: float, viewer: str | None, config: AdaptConfig, folder: Path) -> None:
-        """`folder`: holds what `make_cut` wrote. Raises CheckpointError, SceneError, SettingsError, BackendUnavailable."""
-        self.scale, self.viewer = scale, viewer
+        """`folder`: has what `make_cut` and the jobs wrote. Raises CheckpointError, SceneError, SettingsError, BackendUnavailable."""
+        self.scale, self.viewer, self.folder = scale, viewer, folder
         self.checkpoint, self.kind = find_splats(base.checkpoint)
         stored: dict[str, Any] = load_torch(folder / CUT)
         self.base = Splats(self.kind, [Store(folder / BASE)], stored["places"])
@@ -133,10 +133,10 @@ class TiledScene:
         """The views of all sweeps, and those of validation."""
         return [*views_of(self.views.adapted, self.config, 0, self.config.steps), *self.views.steering, *self.views.choosing]
 
-    def at(self, scale: float, config: AdaptConfig) -> TiledScene:
+    def at(self, scale: float, config: AdaptConfig, folder: Path) -> TiledScene:
         """The same scene at another scale, for its truths only: its views, and the base that they show. It shares this one's memory."""
         other = copy(self)
-        other.scale, other.config = scale, self._affordable(config)
+        other.scale, other.config, other.folder = scale, self._affordable(config), folder
         for name in ("views", "sweeps", "used_views"):
             other.__dict__.pop(name, None)
         return other

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.validation import mean_db
+from mipmap_plugin.adaptation.pixel_size import enough_views, pixel_size
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.blend_weights import may_show, whole_weights
-from mipmap_plugin.adaptation.start.candidates import MILD_COSTS, start_name
+from mipmap_plugin.adaptation.start.candidates import mildest_costs, start_name
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import matched_opacities
 from mipmap_plugin.adaptation.start.merging import merge_seen
-from mipmap_plugin.adaptation.start.pixel_size import enough_views, pixel_size
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.gaussians import Gaussians
@@ -27,18 +27,15 @@ from mipmap_plugin.tiles.splats import Splats
 from mipmap_plugin.tiles.store import Store, write_store
 from mipmap_plugin.tiles.truth import Truths
 
-# The roots of `merge_to` that are tried, as without tiles (`candidates.POWERS`): the last, the mildest, and then the others.
+# What is tried after `merge_to`, where merging loses too much: its roots.
 ROOTS = (1, 2, 4)
-
-CANDIDATES = ("formed", "mildest", "merged")  # names of their files
 
 
 class StartSearch:
-    """Tries the starts of `adaptation.start.candidates` on the whole scene, and leaves the best in `folder`."""
+    """Tries the starts of `adaptation.start.candidates` on the whole scene, and leaves the best in its folder."""
 
-    def __init__(self, scene: TiledScene, folder: Path) -> None:
-        self.scene, self.folder = scene, folder
-        self.truths = Truths(scene, folder)
+    def __init__(self, scene: TiledScene) -> None:
+        self.scene, self.truths = scene, Truths(scene)
         effects = scene.base_effects, scene.target
         self.forms = scene.config.closed_form and not (filter_suffices(*effects) or draws_alike(*effects))
         self.matches = scene.scale <= 1 and self.forms
@@ -54,42 +51,22 @@ class StartSearch:
         pool.release_to_system()
         self._candidate("formed", weights, 1.0)
         formed_db = self.steer(self._open("formed"))
-        if config.merge_to < 1 and self._takes_merged(weights, formed_db, base_db):
-            return
+        for root in ROOTS if config.merge_to < 1 else ():
+            self._candidate("merged", weights, config.merge_to ** (1 / root))
+            merged_db = self.steer(self._open("merged"))
+            costs = mildest_costs(config, scene.base_effects, scene.target) if root == ROOTS[-1] else config.merging_costs
+            if merged_db >= max(formed_db - costs, base_db):
+                return self._take("merged", start_name(self.forms, merged=True), merged_db)
         if formed_db < base_db or not self.forms:
             return self._take_base(base_db)
-        self._take("formed", start_name(self.forms), formed_db)
-
-    def _takes_merged(self, weights: Tensor, formed_db: float, base_db: float) -> bool:
-        """Take what is merged furthest at little cost, and return whether there is any; where the mildest costs too much, no other is tried."""
-
-        def tried(name: str, root: int) -> tuple[float, bool]:
-            self._candidate(name, weights, self.scene.config.merge_to ** (1 / root))
-            psnr = self.steer(self._open(name))
-            return psnr, psnr >= max(formed_db - self._may_cost(root), base_db)
-
-        title, (mildest_db, suits) = start_name(self.forms, merged=True), tried("mildest", ROOTS[-1])
-        for root in ROOTS[:-1] if suits or mildest_db >= formed_db else ():
-            merged_db, is_taken = tried("merged", root)
-            if is_taken:
-                self._take("merged", title, merged_db)
-                return True
-        if suits:
-            self._take("mildest", title, mildest_db)
-        return suits
-
-    def _may_cost(self, root: int) -> float:
-        """How many dB merging to this root of `merge_to` may cost, as without tiles: the mildest more before steps for another renderer."""
-        scene, costs = self.scene, self.scene.config.merging_costs
-        learns = scene.config.steps > 0 and scene.base_effects != scene.target
-        return max(costs, MILD_COSTS) if root == ROOTS[-1] and learns and costs else costs
+        return self._take("formed", start_name(self.forms), formed_db)
 
     def steer(self, splats: Splats) -> float:
         """PSNR (dB) on the steering views."""
         return psnr(self.scene, splats, self.truths, self.scene.views.steering)
 
     def _file(self, name: str, number: int) -> Path:
-        return self.folder / f"{name}_{number}.splats"
+        return self.scene.folder / f"{name}_{number}.splats"
 
     def _open(self, name: str) -> Splats:
         return Splats.of(self.scene.kind, [Store(self._file(name, number)) for number in range(len(self.scene.cores))])
@@ -159,12 +136,10 @@ class StartSearch:
         self._take("formed", AS_IT_IS, psnr)
 
     def _take(self, name: str, title: str, psnr: float) -> None:
-        """Leave the splats of a candidate as the start, and of the others nothing."""
+        """Leave the splats of a candidate as the start."""
         for number in range(len(self.scene.cores)):
-            self._file(name, number).replace(start_file(self.folder, number))
-            for other in CANDIDATES:
-                self._file(other, number).unlink(missing_ok=True)
-        save_torch(self.folder / START, {"name": title, "psnr": psnr}, overwrite=True)
+            self._file(name, number).replace(start_file(self.scene.folder, number))
+        save_torch(self.scene.folder / START, {"name": title, "psnr": psnr}, overwrite=True)
 
 
 def _set_opacities(model: VanillaModel, opacities: Tensor) -> None:

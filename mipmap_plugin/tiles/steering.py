@@ -2,8 +2,8 @@
 
 A tile by itself cannot tell: what it shows of a view is a part of its error. In the warm-up a state does harm if it is worse than the start, as
 without tiles; later if it is worse than the best of its sweep, or than what that began with: in front of halos that stay as they are, rates
-that are too high drive all tiles further and further off. On flowers (300,000 and a million splats, 8 tiles, 60 steps) the first 13 steps
-after the warm-up ended below the start so, and done again at half of the rates 1 to 2 dB above the best before.
+that are too high drive all tiles further and further off (the first steps after the warm-up of flowers with a million splats ended below the
+start so, and done again at half of the rates 1 to 2 dB above the best before).
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from itertools import count
 from pathlib import Path
 
-from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
-from mipmap_plugin.adaptation.optimization.validation import HARM_DB, RATE_REDUCTION, TIE_DB, Steering
+from mipmap_plugin.adaptation.optimization.validation import HARM_DB, RATE_REDUCTION, TIE_DB, warmed_up
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.torch_file import load_torch
@@ -55,14 +54,14 @@ class Steered:
         return start_file(folder, number) if self.sweep < 0 else tile_file(folder, number, self.sweep, self.step)
 
 
-def sweep_of(scene: TiledScene, folder: Path, number: int) -> Sweep | None:
+def sweep_of(scene: TiledScene, number: int) -> Sweep | None:
     """The `number`-th sweep that is made, once the one before it was steered; None if there is none."""
-    return Steered.before(folder, number).following if number else next(iter(scene.sweeps), None)
+    return Steered.before(scene.folder, number).following if number else next(iter(scene.sweeps), None)
 
 
-def open_state(scene: TiledScene, folder: Path, state: Steered) -> Splats:
+def open_state(scene: TiledScene, state: Steered) -> Splats:
     """The splats of all tiles in a state, tile after tile."""
-    return Splats.of(scene.kind, [Store(state.file(folder, number)) for number in range(len(scene.cores))])
+    return Splats.of(scene.kind, [Store(state.file(scene.folder, number)) for number in range(len(scene.cores))])
 
 
 def result(folder: Path) -> Steered:
@@ -70,15 +69,15 @@ def result(folder: Path) -> Steered:
     return Steered.before(folder, next(number for number in count() if not steered_file(folder, number).exists()))
 
 
-def steer(scene: TiledScene, sweep: Sweep, folder: Path) -> None:
+def steer(scene: TiledScene, sweep: Sweep) -> None:
     """Measure the whole at each check of a sweep, and write what the next sweep begins with."""
-    before = Steered.before(folder, sweep.number)
-    truths, psnrs, harmful, start_db = Truths(scene, folder), [], False, load_torch(folder / START)["psnr"]
+    before = Steered.before(scene.folder, sweep.number)
+    truths, psnrs, harmful, start_db = Truths(scene), [], False, load_torch(scene.folder / START)["psnr"]
     best, best_db, ceiling = before, before.psnr if sweep.number else start_db, before.ceiling
     warms_up = sweep.end <= scene.config.warm_up_steps  # rates that lose a little in a few steps may gain in many
     for step in sweep.checks:
         state = Steered(sweep.number, step)
-        psnrs.append(psnr(scene, open_state(scene, folder, state), truths, scene.views.steering))
+        psnrs.append(psnr(scene, open_state(scene, state), truths, scene.views.steering))
         if psnrs[-1] < (start_db if warms_up else best_db) - HARM_DB and scene.config.returns == "best":
             ceiling, harmful = RATE_REDUCTION * rate_factor(scene, step, ceiling), True
             break
@@ -89,7 +88,7 @@ def steer(scene: TiledScene, sweep: Sweep, folder: Path) -> None:
     again = harmful and not warms_up and sweep.repeats < MOST_REPEATS
     following = repeated(sweep, best) if again else next_planned(scene, sweep)
     after = Steered(best.sweep, best.step, ceiling, tuple(psnrs), best_db, following)
-    write_json(steered_file(folder, sweep.number), asdict(after), overwrite=True)
+    write_json(steered_file(scene.folder, sweep.number), asdict(after), overwrite=True)
 
 
 def repeated(sweep: Sweep, best: Steered) -> Sweep:
@@ -107,4 +106,4 @@ def next_planned(scene: TiledScene, sweep: Sweep) -> Sweep | None:
 
 def rate_factor(scene: TiledScene, step: int, ceiling: float) -> float:
     """The factor of all rates in a step."""
-    return Steering(0.0, 0.0, Snapshot({}, {}), ceiling=ceiling).rate_factor(step, scene.config)
+    return min(warmed_up(step, scene.config), ceiling)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from threading import Lock
 from typing import ClassVar
 
@@ -51,12 +50,12 @@ class _Surrounding:
 class Surroundings:
     """The halo of a tile in a sweep's views; with splats of the core and a crop's camera, it renders both together."""
 
-    def __init__(self, scene: TiledScene, number: int, sweep: Sweep, folder: Path) -> None:
+    def __init__(self, scene: TiledScene, number: int, sweep: Sweep) -> None:
         self._scene, self._number = scene, number
         self._effects = on_black(scene.target)
-        self._truths = Truths(scene, folder)
-        self._layers = Album([layer_file(folder, number, sweep.halos)])
-        self._halos = Album(halo_file(folder, part, sweep.halos) for part in range(parts(scene.sweep_views(sweep))))
+        self._truths = Truths(scene)
+        self._layers = Album([layer_file(scene.folder, number, sweep.halos)])
+        self._halos = Album(halo_file(scene.folder, part, sweep.halos) for part in range(parts(scene.sweep_views(sweep))))
         self._kept: dict[str, _Surrounding] = {}
         self._lock = Lock()  # views are asked for side by side
 
@@ -70,7 +69,7 @@ class Surroundings:
         return replace(target, width=right - left, height=bottom - top, cx=target.cx - left, cy=target.cy - top, zoom=1.0)
 
     def _box(self, name: str) -> Box:
-        box = self._halos.entry(f"{name}/{self._number}").box
+        box = self._halos.box(f"{name}/{self._number}")
         assert box is not None  # since those of tiles have one
         return box
 
@@ -87,7 +86,7 @@ class Surroundings:
         through, behind, share = (self._halos[f"{name}/{self._number}"].float() / FINE).split((1, 3, 1), dim=2)
         image = within(from_16_bits(self._halos[name]), box)
         truth = within(self._truths.named(name), box)
-        x, y = (self._layers.entry(name).box or (0, 0))[:2]
+        x, y = (self._layers.box(name) or (0, 0))[:2]
         left, top, right, bottom = box
         before = within(self._layers[name], (left - x, top - y, right - x, bottom - y)).float()
         core = through * before[..., :3] + before[..., 3:] * behind

@@ -29,12 +29,12 @@ STEERED_AS_A_WHOLE = {"returns": "last", "target_db": None, "patience": None}
 class Tile:
     """A core with its views, in one sweep."""
 
-    def __init__(self, scene: TiledScene, number: int, sweep: Sweep, folder: Path) -> None:
-        self.scene, self.number, self.sweep, self.folder = scene, number, sweep, folder
+    def __init__(self, scene: TiledScene, number: int, sweep: Sweep) -> None:
+        self.scene, self.number, self.sweep = scene, number, sweep
         self.config = scene.config.model_copy(update=STEERED_AS_A_WHOLE)
-        self.before = Steered.before(folder, sweep.number)
-        self.student = scene.for_target(Store(self.before.file(folder, number)).parameters())
-        self.surroundings = Surroundings(scene, number, sweep, folder)
+        self.before = Steered.before(scene.folder, sweep.number)
+        self.student = scene.for_target(Store(self.before.file(scene.folder, number)).parameters())
+        self.surroundings = Surroundings(scene, number, sweep)
         self.crops = [*map(self.surroundings.crop, scene.views.adapted)]
 
     def adapt(self, resume: Path) -> tuple[dict[str, Any], dict[str, Any], StateKeeper | None]:
@@ -68,7 +68,7 @@ class Tile:
 
     def _write(self, parameters: dict[str, Any], steps: Any) -> None:
         for step in steps:
-            write_store(tile_file(self.folder, self.number, self.sweep.number, step), parameters)
+            write_store(tile_file(self.scene.folder, self.number, self.sweep.number, step), parameters)
 
     def _continue(self, run: Run) -> None:
         """Let a run go on in the state that it was steered to, with Adam's moments if that state ended a sweep."""
@@ -76,8 +76,8 @@ class Tile:
         run.curve[0] = run.curve[0].model_copy(update={"step": run.step})
         if not self.sweep.number:
             return
-        run.watch.seconds += load_torch(run_file(self.folder, self.number, self.sweep.number - 1)).get("seconds", 0.0)
-        saved = load_torch(run_file(self.folder, self.number, self.before.sweep)) if self.before.sweep >= 0 else {}
+        run.watch.seconds += load_torch(run_file(self.scene.folder, self.number, self.sweep.number - 1)).get("seconds", 0.0)
+        saved = load_torch(run_file(self.scene.folder, self.number, self.before.sweep)) if self.before.sweep >= 0 else {}
         if saved.get("step") == self.before.step:
             run.optimizer.load_state_dict(saved["optimizer"])
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from pathlib import Path
 
 from torch import Tensor
 
@@ -32,15 +31,15 @@ def part_of(views: Sequence[Camera], number: int) -> Sequence[Camera]:
     return views[number * VIEWS : (number + 1) * VIEWS]
 
 
-def draw_truths(scene: TiledScene, part: int, folder: Path, others: Sequence[tuple[TiledScene, Path]] = ()) -> None:
-    """Draw the `part`-th views, and write them to their file in `folder`, in 16 bits.
+def draw_truths(scene: TiledScene, part: int, others: Sequence[TiledScene] = ()) -> None:
+    """Draw the `part`-th views, and write them to their file, in 16 bits.
 
-    `others`: the same scene at further scales, each with its own folder. The part is written for them too if it has the same views there.
+    `others`: the same scene at further scales. The part is written for them too if it has the same views there.
     """
     views = part_of(scene.used_views, part)
-    sharing = [(scene, folder), *(other for other in others if _shares(scene, other[0], part))]
+    sharing = [scene, *(other for other in others if _shares(scene, other, part))]
     with ExitStack() as files:  # the first file, its own, is closed last: it says that all are there
-        writers = [(each, files.enter_context(new_pictures(truth_file(of, part)))) for each, of in sharing]
+        writers = [(each, files.enter_context(new_pictures(truth_file(each.folder, part)))) for each in sharing]
         for view in views:
             image = draw_base(scene, view)
             for each, write in writers:
@@ -74,8 +73,8 @@ def _fraction(scene: TiledScene) -> float:
 class Truths:
     """The truths of all views that are used, on the disk."""
 
-    def __init__(self, scene: TiledScene, folder: Path) -> None:
-        self._album = Album(truth_file(folder, part) for part in range(parts(scene.used_views)))
+    def __init__(self, scene: TiledScene) -> None:
+        self._album = Album(truth_file(scene.folder, part) for part in range(parts(scene.used_views)))
 
     def __call__(self, view: Camera) -> Tensor:
         """The truth [h, w, 3] of a whole view, which is found by its name."""

@@ -15,10 +15,11 @@ from mipmap_plugin import cli
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.evaluation.measure import baselines
-from mipmap_plugin.evaluation.tradeoff import points as measuring
+from mipmap_plugin.evaluation.tradeoff import measuring
 from mipmap_plugin.evaluation.tradeoff.files import Folder, facts, table
 from mipmap_plugin.evaluation.tradeoff.front import Tradeoff
-from mipmap_plugin.evaluation.tradeoff.points import OBSERVED_STEPS, RENDERERS, Plan, measure
+from mipmap_plugin.evaluation.tradeoff.measuring import OBSERVED_STEPS, RENDERERS, measure
+from mipmap_plugin.evaluation.tradeoff.points import Plan
 from mipmap_plugin.evaluation.tradeoff.run import run
 from mipmap_plugin.evaluation.tradeoff.truth import base_itself, photographs
 from mipmap_plugin.scenes import load_scene

@@ -23,13 +23,13 @@ LEAST_FRACTION = 1 / 4
 # from the clock, so that a run can be resumed.
 DRAWS_A_SECOND = 3e6
 
-# The part of a run's draws that moments may take, each of which is evaluated so often, and the least number of moments. A toy of 4DGaussians has
-# 32.5 dB on views and moments held out with 24, 12 and 6 moments, and loses 0.8 dB with half of the steps. In a time budget steps are worth more.
+# The part of a run's draws that moments may take, each of which is evaluated so often, and the least number of moments: steps are worth more than
+# further moments, most of all in a time budget (docs/recipes_found.md).
 FOR_MOMENTS, ROUNDS, LEAST_MOMENTS = 1 / 2, 5, 6
 FOR_MOMENTS_IN_BUDGET, LEAST_IN_BUDGET = 1 / 6, 2
 
-# Splats in all views for validation, for each second of a time budget: a view is drawn by many checks, or in every state that is chosen from. Sixteen
-# views, as without a budget, take a quarter of a run of two seconds, which costs lego and chair 0.6 dB.
+# Splats in all views for validation, for each second of a time budget: a view is drawn by many checks, or in every state that is chosen from, and
+# as many views as without a budget would take a quarter of a run of two seconds.
 VALIDATED_A_SECOND = 1e5
 
 # The base is drawn so many times finer than the target at most.
@@ -106,8 +106,7 @@ def affordable(config: AdaptConfig, in_view: float) -> AdaptConfig:
 def _fewer(config: AdaptConfig, fraction: float) -> AdaptConfig:
     """The settings with a fraction of the steps.
 
-    Fewer steps have fewer extra views, of which each costs a picture of the base, and smaller pictures: with a fourth of the steps, half of the
-    extra views are as good on flowers and better on bird, and the base drawn three times as fine as the target is worth what four times are.
+    Fewer steps have fewer extra views, of which each costs a picture of the base, and smaller pictures, as good for them (docs/recipes_found.md).
     """
     fewer = {"steps": math.ceil(fraction * config.steps), "extra_views": math.ceil(fraction**0.5 * config.extra_views)}
     if config.truth_oversampling is not None:

@@ -26,8 +26,7 @@ from mipmap_plugin.models.base import SplatModel
 # A step takes so many times as long as its images, drawn one by one: they are drawn together, and then differentiated and moved.
 STEP_OVER_IMAGE = 2.2
 
-# A truth takes so many times as long as its pixels in an image of the new scale: large ones wait for memory, and are made smaller. Chair at
-# 4000 px takes 2 to 4 s, of which its pixels would take 0.8.
+# A truth takes so many times as long as its pixels in an image of the new scale: large ones wait for memory, and are made smaller.
 TRUTH_OVER_IMAGE = 2.5
 
 # A short run uses each view so many times: a truth costs about as much as a view's part of a few steps. With 7, chair loses 0.7 dB in six seconds.

@@ -1,9 +1,9 @@
 """Density control in the loop: transparent splats are removed, and splats are added, on trial if the settings say so.
 
-A clone doubles what its splat hides. On an object, the steps until the next growth recover most of that (lego at x2: from 38 dB to 37
-after 50 steps, and 38 again after 100). In an unbounded scene, where all splats hide each other, they do not (flowers at x2: from 43 dB
-to 18, and 32 after 350 steps). So the rendered views are compared with the base when the next growth is due, and when the run ends. If
-they agree with it less than at the start of the run, the last growth is undone, and no more splats are added.
+A clone doubles what its splat hides. On an object, the steps until the next growth recover from that; in an unbounded scene, where all
+splats hide each other, they do not (flowers at x2: from 43 dB to 18, and 32 after 350 steps). So the rendered views are compared with the
+base when the next growth is due, and when the run ends. If they agree with it less than at the start of the run, the last growth is undone,
+and no more splats are added.
 """
 
 from __future__ import annotations

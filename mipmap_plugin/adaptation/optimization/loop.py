@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -43,7 +43,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     `on_interrupt` is called between two steps, or after the last, when Ctrl-C was pressed, and should raise. `observe` is called before the first
     step and after each step; its time is not counted, and the run ends if it returns True.
     """
-    order, cameras = ViewSchedule(task.views, config), {view: view.zoomed(task.scale) for view in task.views}
+    order = ViewSchedule(task.views, config)
     checks = [step for step in range(1, config.steps + 1) if is_checked(step, config)]
     run.costs.motion = lambda: task.follow.seconds
     forecast = Forecast(order, config, checks, Evaluations(task.follow, config, len(task.validation.steering)), run.step)
@@ -56,7 +56,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
                 views = order(run.step, run.progress(config))
                 _make_truths(run, task, config, order, views)
                 with run.threads.step(len(views), run.costs):
-                    _step(run, task, config, views, cameras)
+                    _step(run, task, config, views)
                 if is_checked(run.step, config):
                     _check(run, task, config)
             left = forecast.left(run.step, run.watch.seconds - began, run.costs, run.steering.ceiling)
@@ -99,25 +99,25 @@ def is_checked(step: int, config: AdaptConfig) -> bool:
 # --8<-- [start:step]
 
 
-def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], cameras: Mapping[Camera, Camera]) -> None:
+def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera]) -> None:
     if run.step == config.reset_opacity_at and task.white_background:
         density.reset_opacities(run.optimizer)
     task.follow(run.student)
     progress = run.progress(config)
     set_rates(run.optimizer, config, progress, run.steering.rate_factor(run.step, config), frozen=frozen_parameters(run))
     growing = run.gradients is not None  # by the gradients of each view, which no step by rows has
-    at_once = 1 if growing else views_at_once(cameras[view] for view in views)
+    at_once = 1 if growing else views_at_once(task.cameras[view] for view in views)
     run.by_rows = None if growing or len(views) > at_once else ByRows.of(run.student, task.render_to_step, run.by_rows)
     if run.by_rows is not None:
-        _step_by_rows(run, run.by_rows, task, config, views, cameras)
+        _step_by_rows(run, run.by_rows, task, config, views)
     else:
-        _step_by_autograd(run, task, config, views, cameras, at_once)
+        _step_by_autograd(run, task, config, views, at_once)
     run.step += 1
     if run.step % config.prune_every == 0 and run.step < config.steps:
         control_density(run, task, config)
 
 
-def _step_by_rows(run: Run, rows: ByRows, task: Task, config: AdaptConfig, views: Sequence[Camera], cameras: Mapping[Camera, Camera]) -> None:
+def _step_by_rows(run: Run, rows: ByRows, task: Task, config: AdaptConfig, views: Sequence[Camera]) -> None:
     """A step by the backend, which sums the gradients of the views that are drawn and compared side by side."""
 
     def compare(numbers: Sequence[int], xs: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:  # x: the student
@@ -125,7 +125,7 @@ def _step_by_rows(run: Run, rows: ByRows, task: Task, config: AdaptConfig, views
         targets = [run.costs.truth(view, task.truth) for view in some]  # r(x̂): the frozen base, resized
         return _compare_all(task, config, some, xs, targets)
 
-    square_errors = rows.differentiate([cameras[view] for view in views], run.step * config.views_per_step, compare)
+    square_errors = rows.differentiate([task.cameras[view] for view in views], run.step * config.views_per_step, compare)
     run.square_error = run.square_error + torch.stack(square_errors).mean()
     rows.step(run.optimizer)
 
@@ -133,9 +133,9 @@ def _step_by_rows(run: Run, rows: ByRows, task: Task, config: AdaptConfig, views
 # --8<-- [end:step]
 
 
-def _step_by_autograd(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], cameras: Mapping[Camera, Camera], at_once: int) -> None:
+def _step_by_autograd(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], at_once: int) -> None:
     """A step from the gradients of all splats, which are summed over calls of `at_once` views each if the backend draws several in a call."""
-    splats = Activation(run.student, share=len(views) > 1)
+    splats, cameras = Activation(run.student, share=len(views) > 1), task.cameras
     with large_for_torch(run.student.parameters()["means"]):
         splats.activate(cameras[views[0]])
     at_once = at_once if splats.shares and task.render_views else 1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 import warnings
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -143,8 +142,8 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
         "shared": {name: tensor.detach() for name, tensor in run.student.shared_parameters().items()},
         "optimizer": run.optimizer.state_dict(),
         "gradients": None if run.gradients is None else (run.gradients.total, run.gradients.seen),
-        "steering": {field.name: getattr(run.steering, field.name) for field in fields(run.steering)} | {"best": vars(run.steering.best)},
-        "trial": None if run.trial is None else {field.name: getattr(run.trial, field.name) for field in fields(run.trial)},
+        "steering": vars(run.steering) | {"best": vars(run.steering.best)},
+        "trial": None if run.trial is None else vars(run.trial),
     }
     save_torch(path, state, overwrite=True)
 

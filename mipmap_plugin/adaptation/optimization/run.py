@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -19,8 +20,8 @@ from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.quickest import QuickestThreads
 from mipmap_plugin.adaptation.optimization.validation import Steering, Validation
+from mipmap_plugin.adaptation.pixel_size import pixel_size
 from mipmap_plugin.adaptation.renderers import SteppingRenderer, ViewsRenderer
-from mipmap_plugin.adaptation.start.pixel_size import pixel_size
 from mipmap_plugin.adaptation.target.resize import difference_from
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
@@ -47,6 +48,11 @@ class Task:
     render_views: ViewsRenderer | None = None  # the same in one call, if the backend can
     render_to_step: SteppingRenderer | None = None  # the same if the backend can move the splats itself
     follow: Following = field(default_factory=Following)  # called before each step
+
+    @cached_property
+    def cameras(self) -> Mapping[Camera, Camera]:
+        """The camera of the new scale of each view."""
+        return {view: view.zoomed(self.scale) for view in self.views}
 
     def renderer(self, draw: int) -> Callable[[Gaussians, Camera], Tensor]:
         """The function that renders the `draw`-th view since the beginning: the viewers take turns."""

@@ -21,8 +21,8 @@ from mipmap_plugin.splatting.harmonics import C0
 # Pixels: the blend weight from which on a view shows a splat.
 SHOWN = 0.1
 
-# Fraction of its `whole_weights` below which nothing is known of a splat: no view shows it, or only through gaps. These are 2 % of lego, 3 % of
-# chair, 12 % of a capture seen from all around, 24 % of a made-up panorama, and 61 % of a capture of which one side is shown.
+# Fraction of its `whole_weights` below which nothing is known of a splat: no view shows it, or only through gaps. These are 2 to 24 % of a scene,
+# and 61 % of a capture of which one side is shown.
 UNSEEN = 1e-3
 
 

@@ -10,16 +10,17 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.validation import Quality
+from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS, mean_pixel_size, pixel_size, views_for
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights, may_show, weighed, whole_weights
 from mipmap_plugin.adaptation.start.clock import Clock
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import ROUNDS, matched_opacities
 from mipmap_plugin.adaptation.start.merging import Rounds, merge_down, merge_seen
-from mipmap_plugin.adaptation.start.pixel_size import LEAST_VIEWS, mean_pixel_size, pixel_size, views_for
 from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.adaptation.start.thinning import evenly_in_space, least_fraction
 from mipmap_plugin.camera import evenly
-from mipmap_plugin.effects import SURFEL
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, Thinned
 from mipmap_plugin.models.contract import rebuild, reshape
@@ -30,15 +31,14 @@ from mipmap_plugin.screen_filters import INTEGRATED
 POWERS = (1, 1 / 2, 1 / 4)
 
 # dB that the mildest may cost before steps for a renderer that draws otherwise than the training did, also where other merging may cost less: fewer
-# splats learn that sooner, and better. Lego at x1/8 gains 0.9 dB for spark, 0.8 with the `thorough` recipe, and 1.0 for three.js, chair 0.8 for
-# three.js; bird has as much with three fifths of its splats. What stronger ones cost does not come back: 0.3 to 1.2 dB of chair, 0.4 of flowers.
+# splats learn that sooner, and better, but what stronger merging costs does not come back (docs/recipes_found.md).
 MILD_COSTS = 0.6
 
 # Before them, what starts from a finer level is merged even where too few of its splats share a pixel: else chair would keep half of them at x0.57.
-# What is left has to show at least so many dB: from 29 dB lego's steps regain all that merging cost, from 20 dB those of flowers, a capture, a third.
+# What is left has to show at least so many dB: from 29 dB steps regained all that merging cost, from 20 dB a third.
 COARSE_POWERS, LEAST_DB = (1, 7 / 8, 3 / 4, 5 / 8, 1 / 2), 25.0
 
-# dB by which what is left may be worse than the base itself: steps regain 3 to 8 dB, of lego, of chair and of a capture. What fails is merged less.
+# dB by which what is left may be worse than the base itself: steps regain 3 to 8 dB. What fails is merged less.
 COARSE_COSTS = 3.0
 
 # The fraction of a time budget that the start may take: what it would not finish in it is left out, from the strongest merging on.
@@ -72,6 +72,12 @@ def start_name(forms: bool, *, merged: bool = False, thinned: bool = False) -> s
 UNMATCHED = "the time budget left no time to fit opacities to what splats show in the base's images, so that the start has less dB than it could"
 
 
+def mildest_costs(config: AdaptConfig, base: Effects, target: Effects) -> float:
+    """dB that the mildest merging may cost."""
+    learns = config.steps > 0 and base != target and config.merging_costs
+    return max(config.merging_costs, MILD_COSTS) if learns else config.merging_costs
+
+
 class StartSearch:
     """The candidates, and the choice among them by their PSNR on the steering views."""
 
@@ -88,8 +94,7 @@ class StartSearch:
         self._alike = draws_alike(problem.base_effects, problem.target)
         # The steps of a zoom-out end 0.2 dB higher from the base's own shapes (lego and chair, x1/4).
         keeps = self._alike and problem.config.steps > 0 and problem.scale <= 1
-        costs, learns = problem.config.merging_costs, problem.config.steps > 0 and problem.base_effects != problem.target
-        self._more_costs = max(0.0, MILD_COSTS - costs) if learns and costs else 0.0
+        self._more_costs = mildest_costs(problem.config, problem.base_effects, problem.target) - problem.config.merging_costs
         unchanged = keeps or filter_suffices(problem.base_effects, problem.target)
         self._forms = problem.config.closed_form and not keeps
         spreads = problem.target.screen_filter == SURFEL or problem.target.screen_filter in INTEGRATED  # otherwise than by a variance in px²
@@ -208,16 +213,11 @@ class StartSearch:
 
     def _closed_form(self, gaussians: Gaussians, weights: Tensor | None) -> tuple[Tensor, Tensor]:
         """Scales [N, 3] and opacities [N] in closed form, with opacities that match the blend weights where these are known."""
-        problem = self._problem
-        rounds = wanted = ROUNDS if self._matches_weights and weights is not None else 0
-        while rounds and not self._clock.allows("weights", rounds):
-            rounds -= 1
-        if rounds == 0 < wanted and UNMATCHED not in self.notes:
-            self.notes.append(UNMATCHED)
+        problem, rounds = self._problem, self._matching_rounds(weights)
         area_power = 1.0 if rounds else AREA_POWER
         pixel = self._pixel_size(gaussians.means)
         formed_for = mean_pixel_size(gaussians.means, problem.closest_of, self._count) if problem.scale > 1 else pixel
-        settings = FormSettings(area_power, problem.config.crispness, self._count, formed_for, matched=weights is not None and rounds > 0)
+        settings = FormSettings(area_power, problem.config.crispness, self._count, formed_for, matched=rounds > 0)
         scales, opacities = closed_form(gaussians, problem.views, problem.scale, problem.base_effects, problem.target, settings)
         if weights is None or not rounds:
             return scales, opacities
@@ -230,6 +230,15 @@ class StartSearch:
             return blend_weights(replace(gaussians, scales=scales, opacities=opacities), views, problem.backend, target) * finer**2
 
         return scales, matched_opacities(opacities, weights, self._whole_weights(gaussians, pixel), weights_of, rounds)
+
+    def _matching_rounds(self, weights: Tensor | None) -> int:
+        """How many rounds opacities are matched in: none without blend weights, and no more than there is time for."""
+        rounds = wanted = ROUNDS if self._matches_weights and weights is not None else 0
+        while rounds and not self._clock.allows("weights", rounds):
+            rounds -= 1
+        if rounds == 0 < wanted and UNMATCHED not in self.notes:
+            self.notes.append(UNMATCHED)
+        return rounds
 
     def _whole_weights(self, gaussians: Gaussians, pixel: Tensor) -> Tensor:
         problem = self._problem

@@ -12,34 +12,33 @@ opacity can make up for, so that the blend weight stays the same. For a viewer t
 
 Zoom-in (s > 1) widens the splats, but by less: the images that a base was trained on are averages over pixels, which have a variance of
 p = 1/12 px², and the adapted images should be averages over their own, smaller pixels. Σ + e·ρ² includes this average, so that e and e'
-are both reduced by p, and the opacity is raised by the area that is lost (+0.3 dB after the default steps on photographs of lego and chair
-at x2 and x4). Images of the base's size do not show how much of e is such an average, and how much is a splat's own extent: all values
-from p = 1/12 to p = e give nearly the same image. A larger p is crisper: with p = e splats keep their size, and only opacity makes up for
-what a zoom takes off them (`FormSettings.crispness`).
+are both reduced by p, and the opacity is raised by the area that is lost. Images of the base's size do not show how much of e is such an
+average, and how much is a splat's own extent: all values from p = 1/12 to p = e give nearly the same image. A larger p is crisper: with
+p = e splats keep their size, and only opacity makes up for what a zoom takes off them (`FormSettings.crispness`).
 
 A file that is rendered with the base's own filter needs no change if that filter integrates over the pixel. One that compensates models the
 pixel in each view too, but with a variance of its own, and overlapping splats whose opacities it lowers let through more than their means
-would: with matched opacities the closed form is better by 2 to 8 dB (lego and chair, antialiased, x1/4, x1/8, x2 and x4), at x0.7 it is not.
-Without these, and before the steps of a zoom-out, it is left out.
+would: with matched opacities the closed form is better by 2 to 8 dB, but near the base's scale it is not. Without these, and before the steps
+of a zoom-out, it is left out.
 
 Opacities from areas are exact for splats that hide nothing; where blend weights are known they are matched afterwards (`matching`).
 
 At zoom-out the distance is that of the closest view, which saw the finest detail that training could resolve (as for the 3D filter of
 Mip-Splatting): elsewhere splats then stay too wide, and lower opacities make up for it. At zoom-in they would leave holes in views from
-farther away, so they are widened for the mean of the views (`mean_pixel_size`). Without steps this is worth 0.3 to 0.4 dB on photographs of
-lego and chair at x2 and x4, and 2.6 dB on a capture of flowers at x2.
+farther away, so they are widened for the mean of the views (`mean_pixel_size`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.parallel import in_batches, in_chunks
-from mipmap_plugin.adaptation.start.pixel_size import enough_views, mean_pixel_size, pixel_size
+from mipmap_plugin.adaptation.pixel_size import enough_views, mean_pixel_size, pixel_size
 from mipmap_plugin.adaptation.start.surfel_form import visible_area, widened_for_slant, widened_to_filter
 from mipmap_plugin.backends.cpu import summed_areas
 from mipmap_plugin.camera import Camera, every_nth
@@ -81,34 +80,96 @@ def closed_form(
     if filter_suffices(base, target) or (draws_alike(base, target) and not form.matched):
         return gaussians.scales, gaussians.opacities
     count = form.views or enough_views(gaussians.means, views)
-    size, some = pixel_size if scale <= 1 else mean_pixel_size, every_nth(views, count)
+    size = pixel_size if scale <= 1 else mean_pixel_size
+    change = _Change(every_nth(views, count), scale, base, target, form)
     pixels = size(gaussians.means, views, count) if form.pixel is None else form.pixel
-    formed = in_chunks(lambda chunk: _form(gaussians[chunk], pixels[chunk], some, scale, (base, target), form), gaussians.means)
+    formed = in_chunks(lambda chunk: change.of(gaussians[chunk], pixels[chunk]), gaussians.means)
     scales, opacities = zip(*formed, strict=True)
     return torch.cat(scales), torch.cat(opacities)
 
 
-def _form(
-    gaussians: Gaussians, base_pixel: Tensor, views: Sequence[Camera], scale: float, effects: tuple[Effects, Effects], form: FormSettings
-) -> tuple[Tensor, Tensor]:
-    """`closed_form` of some of the splats; `base_pixel` [N]: in world units; `effects`: of base and target."""
-    base, target = effects
-    if target.screen_filter == SURFEL:
-        return _of_surfels(gaussians, views, scale, (base, target), base_pixel, form)
-    target_pixel = base_pixel / scale
-    averaging = _averaging_variance(base, form.crispness) if scale > 1 else 0.0
-    wide = gaussians.scales.square() + ((filter_variance(base) - averaging) * base_pixel**2)[:, None]
-    narrow = (wide - ((filter_variance(target) - averaging) * target_pixel**2)[:, None]).clamp_min(0)
-    if compensates(target.screen_filter):  # the area shrinks only by the factor by which the opacity can rise
-        narrow = narrow.maximum(gaussians.opacities[:, None] * wide)
-    thinnest = torch.full_like(narrow, MIN_AXIS**2).scatter(1, wide.topk(2, dim=1).indices, max(MIN_AXIS**2, min_variance(target)))
-    scales = narrow.maximum(thinnest * target_pixel[:, None].square()).sqrt()
-    new = replace(gaussians, scales=scales)
-    opacities = gaussians.opacities * _compensation(gaussians, views, base)
-    areas = _area_ratio(gaussians, new, views, scale, (base, target), _max_area_ratio(base, target, scale, averaging))
-    opacities = opacities * areas ** (form.area_power if scale <= 1 and not compensates(target.screen_filter) else 1.0)
-    # The compensation of the target's renderer is divided out beforehand.
-    return scales, (opacities / _compensation(new, [view.zoomed(scale) for view in views], target)).clamp_max(1)
+@dataclass(frozen=True)
+class _Change:
+    """From what the base looks like to what the result does, by some views."""
+
+    views: Sequence[Camera]  # of the base scale
+    scale: float
+    base: Effects
+    target: Effects
+    form: FormSettings
+
+    @cached_property
+    def zoomed(self) -> list[Camera]:
+        """The views at the new scale."""
+        return [view.zoomed(self.scale) for view in self.views]
+
+    def of(self, gaussians: Gaussians, base_pixel: Tensor) -> tuple[Tensor, Tensor]:
+        """`closed_form` of some of the splats; `base_pixel` [N]: in world units."""
+        base, target, scale = self.base, self.target, self.scale
+        if target.screen_filter == SURFEL:
+            return self._of_surfels(gaussians, base_pixel)
+        target_pixel = base_pixel / scale
+        averaging = _averaging_variance(base, self.form.crispness) if scale > 1 else 0.0
+        wide = gaussians.scales.square() + ((filter_variance(base) - averaging) * base_pixel**2)[:, None]
+        narrow = (wide - ((filter_variance(target) - averaging) * target_pixel**2)[:, None]).clamp_min(0)
+        if compensates(target.screen_filter):  # the area shrinks only by the factor by which the opacity can rise
+            narrow = narrow.maximum(gaussians.opacities[:, None] * wide)
+        thinnest = torch.full_like(narrow, MIN_AXIS**2).scatter(1, wide.topk(2, dim=1).indices, max(MIN_AXIS**2, min_variance(target)))
+        scales = narrow.maximum(thinnest * target_pixel[:, None].square()).sqrt()
+        new = replace(gaussians, scales=scales)
+        opacities = gaussians.opacities * _compensation(gaussians, self.views, base)
+        areas = self._area_ratio(gaussians, new, self._max_area_ratio(averaging))
+        opacities = opacities * areas ** (self.form.area_power if scale <= 1 and not compensates(target.screen_filter) else 1.0)
+        # The compensation of the target's renderer is divided out beforehand.
+        return scales, (opacities / _compensation(new, self.zoomed, target)).clamp_max(1)
+
+    def _max_area_ratio(self, averaging: float) -> float:
+        """The largest factor of an opacity. It is exact for a splat of no size of its own; in a distant view all splats look like that."""
+        if averaging:
+            return filter_variance(self.base) / (filter_variance(self.base) - averaging + averaging / self.scale**2)
+        return torch.inf if compensates(self.target.screen_filter) else 1.0
+
+    def _area_ratio(self, old: Gaussians, new: Gaussians, limit: float) -> Tensor:
+        """[N], at most `limit`: the area of an old splat in the base over that of the new one in the target.
+
+        Both are sums over the views, as blend weights are: the mean of the views' ratios would follow the many distant views of a walk, and take a
+        splat away from the close one.
+        """
+        variances = filter_variance(self.base) * self.scale**2, filter_variance(self.target)
+        axes = [axes_of(each.quats, each.scales) for each in (old, new)]
+
+        def areas(_: CameraTensors, projected: Projected) -> Tensor:
+            new_projected = projected.with_axes(axes[1]) if new.covariances is None else projected
+            return torch.stack([_det(projected, variances[0]), _det(new_projected, variances[1])]).sqrt()
+
+        near, plain = self.base.near_plane, old.covariances is None
+        known = summed_areas(old.means, zip(axes, variances, strict=True), self.zoomed, near) if plain else None
+        before, after = _mean_in_front(old, self.zoomed, near, areas) if known is None else known
+        ratio = (before / after).to(old.opacities)
+        return torch.where(ratio.isfinite(), ratio, 1.0).clamp_max(limit)  # areas beyond the type's range: the splat keeps its opacity
+
+    def _of_surfels(self, gaussians: Gaussians, base_pixel: Tensor) -> tuple[Tensor, Tensor]:
+        """Scales [N, 3] and opacities [N] of surfels (`surfel_form`); `base_pixel` [N]: in world units."""
+        base, target, crispness = self.base, self.target, self.form.crispness
+
+        def area_ratio(scales: Tensor) -> Tensor:
+            """[N]: the visible area of splats of these scales in the target over their visible area in the base."""
+            new = replace(gaussians, scales=scales)
+
+            def ratio(camera: CameraTensors, projected: Projected) -> Tensor:
+                base_area = visible_area(projected, base.eps2d * self.scale**2)
+                return visible_area(project(new, camera, target.near_plane), target.eps2d) / base_area
+
+            return _mean_in_front(gaussians, self.zoomed, base.near_plane, ratio)
+
+        if self.scale <= 1:
+            return gaussians.scales, gaussians.opacities / area_ratio(gaussians.scales) ** AREA_POWER
+        wide = widened_to_filter(gaussians.scales, base_pixel, base.eps2d)
+        wide = widened_for_slant(gaussians.scales, wide, 1 / area_ratio(wide))
+        if crispness == 0:
+            return wide, gaussians.opacities
+        crisp = wide.square().lerp(gaussians.scales.square(), crispness).sqrt()
+        return crisp, (gaussians.opacities * area_ratio(wide) / area_ratio(crisp)).clamp_max(1)
 
 
 def filter_suffices(base: Effects, target: Effects) -> bool:
@@ -120,39 +181,6 @@ def draws_alike(base: Effects, target: Effects) -> bool:
     """Whether base and target have the same filter, which compensates."""
     same = (base.screen_filter, base.eps2d) == (target.screen_filter, target.eps2d)
     return same and compensates(target.screen_filter) and target.screen_filter != SURFEL
-
-
-def _max_area_ratio(base: Effects, target: Effects, scale: float, averaging: float) -> float:
-    """The largest factor of an opacity. It is exact for a splat of no size of its own; in a distant view all splats look like that."""
-    if averaging:
-        return filter_variance(base) / (filter_variance(base) - averaging + averaging / scale**2)
-    return torch.inf if compensates(target.screen_filter) else 1.0
-
-
-def _of_surfels(
-    gaussians: Gaussians, views: Sequence[Camera], scale: float, effects: tuple[Effects, Effects], base_pixel: Tensor, form: FormSettings
-) -> tuple[Tensor, Tensor]:
-    """Scales [N, 3] and opacities [N] of surfels (`surfel_form`). `effects`: of base and target; `base_pixel` [N]: in world units."""
-    base, target = effects
-    zoomed = [view.zoomed(scale) for view in views]
-
-    def area_ratio(scales: Tensor) -> Tensor:
-        """[N]: the visible area of splats of these scales in the target over their visible area in the base."""
-        new = replace(gaussians, scales=scales)
-
-        def ratio(camera: CameraTensors, projected: Projected) -> Tensor:
-            return visible_area(project(new, camera, target.near_plane), target.eps2d) / visible_area(projected, base.eps2d * scale**2)
-
-        return _mean_in_front(gaussians, zoomed, base.near_plane, ratio)
-
-    if scale <= 1:
-        return gaussians.scales, gaussians.opacities / area_ratio(gaussians.scales) ** AREA_POWER
-    wide = widened_to_filter(gaussians.scales, base_pixel, base.eps2d)
-    wide = widened_for_slant(gaussians.scales, wide, 1 / area_ratio(wide))
-    if form.crispness == 0:
-        return wide, gaussians.opacities
-    crisp = wide.square().lerp(gaussians.scales.square(), form.crispness).sqrt()
-    return crisp, (gaussians.opacities * area_ratio(wide) / area_ratio(crisp)).clamp_max(1)
 
 
 def min_variance(effects: Effects) -> float:
@@ -180,26 +208,6 @@ def _compensation(gaussians: Gaussians, views: Sequence[Camera], effects: Effect
     ones = torch.ones_like(gaussians.opacities)
     variance = filter_variance(effects)
     return _mean_in_front(gaussians, views, effects.near_plane, lambda _, projected: footprint(projected, ones, name, variance).opacities)
-
-
-def _area_ratio(old: Gaussians, new: Gaussians, views: Sequence[Camera], scale: float, effects: tuple[Effects, Effects], limit: float) -> Tensor:
-    """[N], at most `limit`: the area of an old splat in the base over that of the new one in the target; `effects`: of base and target.
-
-    Both are sums over the views, as blend weights are: the mean of the views' ratios would follow the many distant views of a walk, and take a
-    splat away from the close one.
-    """
-    base, target = effects
-    zoomed, variances = [view.zoomed(scale) for view in views], (filter_variance(base) * scale**2, filter_variance(target))
-    axes = [axes_of(each.quats, each.scales) for each in (old, new)]
-
-    def areas(_: CameraTensors, projected: Projected) -> Tensor:
-        new_projected = projected.with_axes(axes[1]) if new.covariances is None else projected
-        return torch.stack([_det(projected, variances[0]), _det(new_projected, variances[1])]).sqrt()
-
-    known = summed_areas(old.means, zip(axes, variances, strict=True), zoomed, base.near_plane) if old.covariances is None else None
-    before, after = _mean_in_front(old, zoomed, base.near_plane, areas) if known is None else known
-    ratio = (before / after).to(old.opacities)
-    return torch.where(ratio.isfinite(), ratio, 1.0).clamp_max(limit)  # areas beyond the type's range: the splat keeps its opacity
 
 
 def _mean_in_front(gaussians: Gaussians, views: Sequence[Camera], near: float, quantity: Callable[[CameraTensors, Projected], Tensor]) -> Tensor:

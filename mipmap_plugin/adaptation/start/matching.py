@@ -23,7 +23,7 @@ MAX_FACTOR = 4.0
 INVISIBLE_WEIGHT = 1e-4
 
 # Fraction of the weight that a splat would have if nothing hid it, added too: what shows of hidden splats, or at the edge of a view, says little
-# of their opacities. A phone's capture of which one side is shown keeps 1 dB more of the others by it, and none of that side is lost.
+# of their opacities. A capture of which one side is shown keeps 1 dB more of the others by it.
 HARDLY_SEEN = 1e-3
 
 

@@ -73,7 +73,7 @@ class BaseImages:
         """The camera of an image, and how it is rendered."""
         # Resized, not zoomed: the model sees the `zoom` of its training, so that it shows the same splats, only with fewer pixels.
         factor = fraction / view.zoom  # a view of a band (`over_band`) samples `zoom` times as finely as the base
-        size = (view.width, view.height) if factor == 1 else (max(1, round(view.width * factor)), max(1, round(view.height * factor)))
+        size = (max(1, round(pixels * factor)) for pixels in (view.width, view.height))
         camera = view if (factor, view.zoom) == (1, 1) else replace(view.resized(*size), zoom=1.0)
         return camera, replace(self.effects, eps2d=self.effects.eps2d * fraction**2)
 

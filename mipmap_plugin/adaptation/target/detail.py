@@ -28,8 +28,8 @@ ROUNDS = 3
 # In colors of 0..1: where the shrunk image differs from the base's by this much, the confidence is a quarter; it falls fast beyond that.
 TRUST = 0.05
 
-# The contrast term has the confidence to this further power: noise has the strongest contrasts of all, and agrees with the base by chance
-# in places. With 2, a network that makes nothing but noise still costs 0.2 dB against the closed form; with 3 nothing.
+# The contrast term has the confidence to this further power, the lowest at which a network that makes nothing but noise costs nothing: noise has
+# the strongest contrasts of all, and agrees with the base by chance in places.
 CONTRAST_POWER = 3
 
 

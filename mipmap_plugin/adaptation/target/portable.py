@@ -1,8 +1,7 @@
 """One file for several viewers: which of them are rendered during the optimization, and which one the start is made for.
 
 A splat that is right in two viewers is right in one between them: between two dilations, with or without compensation, and where fewer
-splats are left out. So steps render the extreme viewers only, in turn. On lego at x1/4 that makes the worst of all viewers 0.7 dB better
-than turns through all of them, half of which render much alike.
+splats are left out. So steps render the extreme viewers only, in turn, and not all of them, half of which render much alike.
 """
 
 from __future__ import annotations
@@ -16,18 +15,15 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.screen_filters import COMPENSATED
 
-# Factor of a recipe's `merge_to`: fewer, larger splats depend less on the filter. At x1/4, half of them make the worst viewer 0.3 dB better
-# on lego, and a quarter no better than that.
+# Factor of a recipe's `merge_to`: fewer, larger splats depend less on the filter; a smaller factor gains no more.
 MERGE_FACTOR = 0.5
 
-# dB that merging may cost before the first step, as that of coarse levels: steps mostly regain more. With the 0.3 dB of a single viewer's file
-# lego at x1/4 keeps all its splats, and its worst viewer ends 4 dB lower; of captures docs/recipes_found.md has what is gained and lost.
+# dB that merging may cost before the first step, as that of coarse levels: steps mostly regain more (docs/recipes_found.md has by how much).
 MERGING_COSTS = 3.0
 
 
 def settings_for_several(config: AdaptConfig) -> dict[str, Any]:
-    """The changes of a recipe's settings. The loss is the mean square error instead of its logarithm, so that the worst viewer counts most:
-    +0.9 dB in it on lego at x1/4, +0.5 on flowers."""
+    """The changes of a recipe's settings. The loss is the mean square error instead of its logarithm, so that the worst viewer counts most."""
     merge_to = config.merge_to * MERGE_FACTOR if config.merge_to < 1 else 1.0
     costs = MERGING_COSTS if config.steps else config.merging_costs
     return {"merge_to": merge_to, "merging_costs": costs, "loss": "l2" if config.loss == "psnr" else config.loss}
@@ -37,8 +33,7 @@ def extreme_targets(targets: Mapping[str, Effects]) -> dict[str, Effects]:
     """The viewers among `targets` that are extreme in one respect, of equals the first: the widest dilation with compensation, of these the one
     that limits colors most, and without; the narrowest dilation; and those that leave out most splats or change them most for their size.
 
-    That is Spark, which also sorts by distance, and not gsplat's antialiased mode: so the worst viewer of flowers, a capture that has colors
-    above 1, is 1.4 dB better at x1/4, the mean of all 0.3 dB; lego is as good, and a made-up capture worse (docs/recipes_found.md).
+    Of those with compensation that is Spark, which also sorts by distance, and not gsplat's antialiased mode (docs/recipes_found.md).
     """
     respects: tuple[Callable[[Effects], tuple[float, ...]], ...] = (
         lambda effects: (0.0 if _compensates(effects) else effects.eps2d,),

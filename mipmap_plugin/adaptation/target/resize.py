@@ -47,7 +47,7 @@ def fitting(config: AdaptConfig, base: Effects) -> AdaptConfig:
     """The settings with the filter that fits a base which is rendered with these effects, where they leave the choice of one.
 
     A base whose screen filter stands for the area of a pixel shows means over that area. For one that is sampled at the pixel's center a bicubic
-    filter is better: photographs of lego and chair at x1.25 to x3 are matched by up to 0.5 dB more, whichever filter shrinks these.
+    filter is better, by up to 0.5 dB (docs/recipes_found.md).
     """
     if config.resize != "fitting":
         return config

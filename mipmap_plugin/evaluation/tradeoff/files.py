@@ -27,15 +27,6 @@ NAMES = ("tradeoff.json", "tradeoff.csv", "tradeoff.png")
 KEPT = "tradeoff.resume"
 
 
-def refuse(folder: Path, picture: bool, overwrite: bool) -> None:
-    """Raise now the errors that `write` would raise at the end: OutputExists, and SettingsError without matplotlib."""
-    if picture:
-        figure_class()
-    for name in NAMES:
-        refuse_output(folder / name, goes_on(Folder(folder, picture, overwrite)).overwrite, is_file=True)
-    refuse_unwritable(folder / NAMES[0])
-
-
 def facts(tradeoffs: Sequence[Tradeoff], complete: bool) -> dict[str, Any]:
     """Everything that was measured, as written to JSON."""
     machine = {"threads": torch.get_num_threads(), "cores": os.cpu_count(), "processor": platform.machine(), **versions()}
@@ -62,6 +53,16 @@ class Folder:
 def goes_on(folder: Folder) -> Folder:
     """The folder, whose results are replaced if they are those of an interrupted command, which are incomplete."""
     return replace(folder, overwrite=folder.overwrite or ((folder.path / KEPT).is_dir() and not _is_complete(folder.path / NAMES[0])))
+
+
+def refuse(folder: Folder) -> None:
+    """Raise now the errors that `write` would raise at the end: OutputExists, and SettingsError without matplotlib."""
+    if folder.picture:
+        figure_class()
+    overwrite = goes_on(folder).overwrite
+    for name in NAMES:
+        refuse_output(folder.path / name, overwrite, is_file=True)
+    refuse_unwritable(folder.path / NAMES[0])
 
 
 def _is_complete(file: Path) -> bool:

@@ -9,7 +9,8 @@ from mipmap_plugin.evaluation.cells import Cells
 from mipmap_plugin.evaluation.protocols import not_exposed
 from mipmap_plugin.evaluation.tradeoff.files import KEPT, Folder, goes_on, write
 from mipmap_plugin.evaluation.tradeoff.front import Tradeoff
-from mipmap_plugin.evaluation.tradeoff.points import Plan, left_out, measure
+from mipmap_plugin.evaluation.tradeoff.measuring import left_out, measure
+from mipmap_plugin.evaluation.tradeoff.points import Plan
 from mipmap_plugin.evaluation.tradeoff.truth import base_itself, photographs
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.wrap import Interrupted, Wrapped

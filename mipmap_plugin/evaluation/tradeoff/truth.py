@@ -18,7 +18,7 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.measure import resized_base, views_seen
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.other_scene import of_another_scene
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, TruthView, test_views
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, TruthView, photographed_views
 from mipmap_plugin.scenes import Scene, jittered
 from mipmap_plugin.scenes.trajectories import with_company
 from mipmap_plugin.wrap import Wrapped
@@ -47,10 +47,7 @@ def photographs(model: Wrapped, scene: Scene, scale: float, most: int | None) ->
 
     Raises SettingsError if there are none, if they are too small, and if no other camera is left to adapt to.
     """
-    scene = model.place(scene)
-    if not model.cameras:
-        raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder, or its cameras (--cameras)")
-    judged: dict[Camera, TruthView] = {view.camera: view for view in test_views(scene, model.cameras, model.background)}
+    judged: dict[Camera, TruthView] = {view.camera: view for view in photographed_views(model, scene)}
     train = [camera for camera in model.cameras if camera.split == "train"] or model.cameras
     views, adapt_on = list(judged), _others(train, list(judged))
     if not adapt_on:

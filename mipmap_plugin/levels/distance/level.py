@@ -19,10 +19,10 @@ from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Task
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, Validation, split_validation
+from mipmap_plugin.adaptation.pixel_size import enough_views
 from mipmap_plugin.adaptation.report import Report, filters, versions
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.compilation import warm_up
-from mipmap_plugin.adaptation.start.pixel_size import enough_views
 from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
 from mipmap_plugin.adaptation.views import choose_views

@@ -14,7 +14,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.start.pixel_size import pixel_size
+from mipmap_plugin.adaptation.pixel_size import pixel_size
 from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
 from mipmap_plugin.adaptation.target.resize import resize

@@ -12,16 +12,14 @@ from mipmap_plugin.backends.cpu import finest_pixels
 from mipmap_plugin.camera import Camera, every_nth
 
 # Number of views from which the area and the blend weight of a splat are computed: doubled, up to a limit, until a splat is in SEEN of them on
-# average. An object needs no more than the least; of a walk through nine rooms these show a third of the splats, and cost the closed form 20 dB
-# at x1/2. With half of SEEN, a phone's capture of a bird ends 0.7 dB lower at x1/4.
+# average. An object needs no more than the least, which would show a third of the splats of a walk through nine rooms.
 LEAST_VIEWS, MOST_VIEWS, SEEN = 12, 192, 8.0
 
-# The closest view of a splat is looked for among this many times more: a view costs less there, and few of them miss it. Along a street and
-# around the bird this is worth 1 to 2.5 dB at x1/4, after the default steps.
+# The closest view of a splat is looked for among this many times more: a view costs less there, and few of them miss it (1 to 2.5 dB of captures).
 CLOSEST_OF = 4
 
 # Of a splat that fewer than this fraction of these have in their pictures they easily miss the closest: it is looked for in all views, so many times
-# at most for all such splats together, in a second. Of nine rooms this is worth 2 dB of the closed form at x1/4.
+# at most for all such splats together, in a second.
 RARE, MOST_LOOKS = 1 / 3, 1 << 23
 
 # Splats that are looked for in views.
