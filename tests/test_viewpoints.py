@@ -83,3 +83,13 @@ def test_each_view_is_looked_at_once():
     wrapped, asked = wrap_model(VanillaModel.from_gaussians(scene(floater=0.04)), backend="reference"), []
     clear = ClearViews(wrapped.model, lambda: asked.append(1) or wrapped.backend()[0], wrapped.effects())
     assert len(clear([looking(-4.0)])) == len(clear([looking(-4.0)])) == len(asked) == 1
+
+
+@pytest.mark.filterwarnings("ignore:no cameras are known")
+def test_choosing_views_takes_a_phase_of_its_own():
+    splats = scene(floater=0.04)
+    far = replace(splats, means=torch.cat([splats.means[:-60], 40 * torch.randn(60, 3, generator=torch.Generator().manual_seed(0))]))
+    lone = wrap_model(VanillaModel.from_gaussians(far), backend="reference")
+    report = lone.adapt(1 / 4, recipe="instant", extra_views=2).report
+    assert lone.viewpoints.orbit.nearest and 0 < report.seconds["views"] < report.seconds["total"]
+    assert "views" not in lone.adapt(1 / 4, recipe="instant", cameras=tiny.cameras(2)).report.seconds

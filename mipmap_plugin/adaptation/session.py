@@ -6,7 +6,7 @@ import hashlib
 import json
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
 
@@ -37,7 +37,8 @@ from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind, remarks, showing, too_unlike
 from mipmap_plugin.adaptation.warn import warn
-from mipmap_plugin.camera import Camera, digest_of, evenly
+from mipmap_plugin.backends.base import Calls
+from mipmap_plugin.camera import ONE_PIXEL, Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.models.base import SplatModel, count_of, digest_of_model, digest_of_parameters
 from mipmap_plugin.models.health import doubts_in
@@ -83,8 +84,9 @@ class Session:
 
     def _choose_views(self, cameras: list[Camera]) -> tuple[list[Camera], list[Camera], str]:
         """The views to adapt to, the views for validation, and a description of the former."""
-        chosen, note = choose_views(cameras, self.viewpoints, self.config)
-        views, validation = split_validation(cameras, chosen, self.viewpoints, self.scale, self.config)
+        with self._looking():
+            chosen, note = choose_views(cameras, self.viewpoints, self.config)
+            views, validation = split_validation(cameras, chosen, self.viewpoints, self.scale, self.config)
         note += f", {len(chosen) - len(views)} of them kept for validation" if len(views) < len(chosen) else ""
         shown = showing(validation, self.base.parameters()["means"], self.base_effects.near_plane)
         if len(shown) > 1:  # one to steer by, and one to choose by; others are the same in every state
@@ -93,6 +95,14 @@ class Session:
             moments = None if self._has_photographs else affordable_moments(self.config, self.base)  # a photograph shows no moment but its own
             views, validation, note = at_their_moments(views, validation, self.config.model_copy(update={"moments": moments}), note)
         return views, validation, note
+
+    def _looking(self) -> AbstractContextManager[None]:
+        """A phase for choosing views where that looks at the base, after what draws it is compiled."""
+        if not (self._orbits and self.viewpoints.orbit.nearest):
+            return nullcontext()
+        with self.phase("compilation"):
+            warm_up(self.backend, self.base.gaussians(ONE_PIXEL), [self.base_effects], Calls(gradients=False, merging=False))
+        return self.phase("views")
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
         """Adapt the base, or continue the run that `resume` holds, and return the best state."""
@@ -103,7 +113,7 @@ class Session:
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
         for remark in filter(None, [*remarks(self.base_views, self.base, near, orbit=self._orbits), too_unlike(self.base_views)]):
             warn(remark)
-        began = now(self.device)
+        began = now(self.device) - sum(self.seconds.values())
         self._compile()
         evaluate_moments(self.base, [*self.views, *self.validation.steering], self.phase)
         search = StartSearch(self._start_problem())
