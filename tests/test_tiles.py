@@ -246,24 +246,26 @@ def cut_in_three(job, **settings):
 @pytest.mark.parametrize(
     ("psnrs", "name"),
     [
-        ((30.0, 20.0, 25.0, 32.0), "the closed form of merged splats"),  # the base, the closed form, and what is merged less and less
-        ((30.0, 31.0, 25.0, 26.0, 27.0), "the closed form"),
+        ((30.0, 20.0, 25.0, 32.0), "the closed form of merged splats"),  # the base, the closed form, what is merged least, and most
+        ((30.0, 31.0, 30.5, 25.0, 26.0), "the closed form of merged splats"),
+        ((30.0, 31.0, 25.0), "the closed form"),  # of which most would lose more
         ((30.0, 20.0, 25.0, 26.0, 27.0), "the base as it is"),
     ],
 )
-def test_no_start_is_worse_than_the_base(job, monkeypatch, psnrs, name):
+def test_no_start_is_worse_than_the_base_and_none_is_tried_in_vain(job, monkeypatch, psnrs, name):
     scene = cut_in_three(job, merge_to=0.5, merging_costs=20.0)
     measured = iter(psnrs)
     monkeypatch.setattr("mipmap_plugin.tiles.start.psnr", lambda *_: next(measured))
     StartSearch(scene).run()
     assert torch.load(scene.folder / "start.pt")["name"] == name and not list(measured)
+    assert sorted(file.name for file in scene.folder.glob("*.splats")) == ["base.splats", "start_0.splats", "start_1.splats", "start_2.splats"]
 
 
 @pytest.mark.parametrize(("eps2d", "name"), [(0.1, "the closed form of merged splats"), (DILATION, "the closed form")])
 def test_the_mildest_merging_may_cost_more_before_steps_for_another_renderer(job, monkeypatch, eps2d, name):
     scene = cut_in_three(job, merge_to=0.5)
     scene.target = replace(scene.target, eps2d=eps2d)
-    measured = iter((20.0, 30.0, 29.5, 29.5, 29.5))  # the base, the closed form, and what is merged less and less
+    measured = iter((20.0, 30.0, 29.5, *((29.5, 29.5) if eps2d < DILATION else ())))  # the base, the closed form, what is merged least, and more
     monkeypatch.setattr("mipmap_plugin.tiles.start.psnr", lambda *_: next(measured))
     monkeypatch.setattr("mipmap_plugin.tiles.start.draws_alike", lambda *_: False)
     StartSearch(scene).run()

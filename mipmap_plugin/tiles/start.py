@@ -27,8 +27,10 @@ from mipmap_plugin.tiles.splats import Splats
 from mipmap_plugin.tiles.store import Store, write_store
 from mipmap_plugin.tiles.truth import Truths
 
-# What is tried after `merge_to`, where merging loses too much: its roots.
+# The roots of `merge_to` that are tried, as without tiles (`candidates.POWERS`): the last, the mildest, and then the others.
 ROOTS = (1, 2, 4)
+
+CANDIDATES = ("formed", "mildest", "merged")  # names of their files
 
 
 class StartSearch:
@@ -51,15 +53,31 @@ class StartSearch:
         pool.release_to_system()
         self._candidate("formed", weights, 1.0)
         formed_db = self.steer(self._open("formed"))
-        for root in ROOTS if config.merge_to < 1 else ():
-            self._candidate("merged", weights, config.merge_to ** (1 / root))
-            merged_db = self.steer(self._open("merged"))
-            costs = mildest_costs(config, scene.base_effects, scene.target) if root == ROOTS[-1] else config.merging_costs
-            if merged_db >= max(formed_db - costs, base_db):
-                return self._take("merged", start_name(self.forms, merged=True), merged_db)
+        if config.merge_to < 1 and self._takes_merged(weights, formed_db, base_db):
+            return
         if formed_db < base_db or not self.forms:
             return self._take_base(base_db)
-        return self._take("formed", start_name(self.forms), formed_db)
+        self._take("formed", start_name(self.forms), formed_db)
+
+    def _takes_merged(self, weights: Tensor, formed_db: float, base_db: float) -> bool:
+        """Take what is merged furthest at little cost, and return whether there is any; where the mildest costs too much, no other is tried."""
+        scene, config = self.scene, self.scene.config
+
+        def tried(name: str, root: int, costs: float) -> tuple[float, bool]:
+            self._candidate(name, weights, config.merge_to ** (1 / root))
+            psnr = self.steer(self._open(name))
+            return psnr, psnr >= max(formed_db - costs, base_db)
+
+        title = start_name(self.forms, merged=True)
+        mildest_db, suits = tried("mildest", ROOTS[-1], mildest_costs(config, scene.base_effects, scene.target))
+        for root in ROOTS[:-1] if suits or mildest_db >= formed_db else ():
+            merged_db, is_taken = tried("merged", root, config.merging_costs)
+            if is_taken:
+                self._take("merged", title, merged_db)
+                return True
+        if suits:
+            self._take("mildest", title, mildest_db)
+        return suits
 
     def steer(self, splats: Splats) -> float:
         """PSNR (dB) on the steering views."""
@@ -136,9 +154,11 @@ class StartSearch:
         self._take("formed", AS_IT_IS, psnr)
 
     def _take(self, name: str, title: str, psnr: float) -> None:
-        """Leave the splats of a candidate as the start."""
+        """Leave the splats of a candidate as the start, and of the others nothing."""
         for number in range(len(self.scene.cores)):
             self._file(name, number).replace(start_file(self.scene.folder, number))
+            for other in CANDIDATES:
+                self._file(other, number).unlink(missing_ok=True)
         save_torch(self.scene.folder / START, {"name": title, "psnr": psnr}, overwrite=True)
 
 
