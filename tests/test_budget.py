@@ -169,7 +169,11 @@ def test_validation_is_measured_as_it_is_done_in_the_middle_of_large_views_and_i
     for view in steering:  # which were used to choose the start
         truth(view)
     validation = Validation(steering, choosing, 1.0, truth, draw, "area", [draw])
-    pace = Pace.of(tiny.model(5), replace(a_task(2), views=whole[:2], scale=1.0, render=draw, validation=validation))
+    task = replace(a_task(2), views=whole[:2], scale=1.0, render=draw, validation=validation)
+    pace = Pace.of(tiny.model(5), task)
     assert pace.a_view == budget.STEP_OVER_IMAGE * 40 * 30
     assert pace.a_check == 2 * 2 * 64
     assert pace.a_choice == 3 * 64 * (1 + 2 * budget.STATES)  # the truth, and each state in two viewers
+    seen.clear()
+    pace = Pace.of(tiny.model(5), replace(task, validation=replace(validation, steering=whole[2:4], choosing=whole[4:])))
+    assert (pace.a_check, len(seen)) == (2 * 2 * 40 * 30, 1)  # the image tells it

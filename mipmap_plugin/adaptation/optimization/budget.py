@@ -58,7 +58,7 @@ class Pace:
         """The pace of a run over `student` that has so many seconds left. The truths that are made for it are used later.
 
         `size`: the fraction of the base's size at which these are drawn. No image and no truth is made if more time than is left is expected of
-        it, by its pixels: of a large image its middle is measured. Validation, which uses no more than the middle, is measured as it is done.
+        it, by its pixels: of a large image its middle is measured. Validation that uses no more than the middle is measured as it is done.
         """
         views, validation = task.views[:REPEATS], task.validation
         cameras = [view.zoomed(task.scale) for view in views]
@@ -77,8 +77,10 @@ class Pace:
         truth = TRUTH_OVER_IMAGE * image * (size / task.scale) ** 2
         truth = truth if truth > left else _shortest(task.truth, views, device)
         moments = {view.time for view in validation.choosing} if task.follow.moments else ()
-        look = _shortest(validates, validation.steering[:REPEATS], device) if validation.steering else 0.0
-        first = _seconds(validates, validation.choosing[0], device) if validation.choosing else 0.0  # with its truth
+        look = first = image * (1 + len(validation.further_renders))
+        if any(view.zoomed(task.scale).size != cameras[0].size for view in validation.choosing[:1]):
+            look = _shortest(validates, validation.steering[:REPEATS], device)
+            first = _seconds(validates, validation.choosing[0], device)  # with its truth
         choice = len(validation.choosing) * (first + (STATES - 1) * look) + STATES * len(moments) * task.follow.evaluation
         return cls(STEP_OVER_IMAGE * image, truth, look * len(validation.steering), choice)
 
