@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.parallel import max_threads
+from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import ONE_PIXEL, Camera, evenly
 from mipmap_plugin.effects import Effects
@@ -30,6 +31,11 @@ LOOK = 64
 # Times as many views as are wanted are tried at most. Of a kitchen that was photographed from one side a quarter are clear.
 ROUNDS = 4
 
+UNCLEAR = (
+    "no generated view sees this capture clearly: all look through fog or walls, or at nothing, and are taken as they are; "
+    "give the scene's cameras (--cameras), or adapt for what you look at (mipmap-plugin view)"
+)
+
 
 @dataclass(frozen=True)
 class Viewpoints:
@@ -39,12 +45,14 @@ class Viewpoints:
     clear: Callable[[Sequence[Camera]], list[Camera]]  # those of the views that see it clearly (`ClearViews`)
 
     def views(self, size: tuple[int, int], count: int, generator: torch.Generator) -> list[Camera]:
-        """`count` views of `size` (height, width) px. Of a capture they are clear; fewer where fewer are, and any where none is."""
+        """`count` views of `size` (height, width) px. Of a capture they are clear: fewer where fewer are, and any, with a warning, where none is."""
         first = self.orbit.views(size, count, generator)
         found = self.clear(first) if self.orbit.nearest else first
         for number in range(1, ROUNDS):
             if len(found) < count:
                 found += evenly(self.clear(self.orbit.views(size, count, generator, number * count)), count - len(found))
+        if not found:
+            warn(UNCLEAR)
         return found or first
 
     def best(self, views: Sequence[Camera]) -> list[Camera]:
