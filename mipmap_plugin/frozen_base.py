@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, SupportsIndex, TypedDict, cast
 
@@ -275,7 +275,8 @@ class FrozenBase:
     @cached_property
     def viewpoints(self) -> Viewpoints:
         """Where views without cameras are. Raises SettingsError without splats."""
-        return Viewpoints(orbit_of(self.model, self.trained.up), ClearViews(self.model, lambda: self.backend()[0], self.effects()))
+        backend = partial(choose_backend, self._backend, self._needs)  # which does not refer to this base, and so keeps no memory
+        return Viewpoints(orbit_of(self.model, self.trained.up), ClearViews(self.model, backend, self.effects()))
 
     def refuse_undrawn(self, views: Sequence[Camera] | None = None, scale: float = 1.0) -> None:
         """Raise SettingsError if none of the views, by default the base's own, shows anything of it at `scale` (`refuse_blind`)."""

@@ -1,5 +1,8 @@
 """From where a scene without cameras is looked at: of a capture by those views of its orbit that see it clearly."""
 
+import gc
+import pickle
+import weakref
 from dataclasses import replace
 
 import pytest
@@ -82,7 +85,7 @@ def test_a_view_of_nothing_is_not_clear():
 
 def test_each_view_is_looked_at_once():
     wrapped, asked = wrap_model(VanillaModel.from_gaussians(scene(floater=0.04)), backend="reference"), []
-    clear = ClearViews(wrapped.model, lambda: asked.append(1) or wrapped.backend()[0], wrapped.effects())
+    clear = ClearViews(wrapped.model, lambda: asked.append(1) or wrapped.backend(), wrapped.effects())
     assert len(clear([looking(-4.0)])) == len(clear([looking(-4.0)])) == len(asked) == 1
 
 
@@ -94,3 +97,26 @@ def test_choosing_views_takes_a_phase_of_its_own():
     report = lone.adapt(1 / 4, recipe="instant", extra_views=2).report
     assert lone.viewpoints.orbit.nearest and 0 < report.seconds["views"] < report.seconds["total"]
     assert "views" not in lone.adapt(1 / 4, recipe="instant", cameras=tiny.cameras(2)).report.seconds
+
+
+@pytest.mark.filterwarnings("ignore:no cameras are known")
+def test_a_base_that_looked_for_clear_views_is_freed_at_once_and_can_be_pickled():
+    lone = wrap_model(VanillaModel.from_gaussians(scene(floater=0.04)), backend="reference")
+    assert lone.viewpoints.clear([looking(-4.0)])
+    again = pickle.loads(pickle.dumps(lone))
+    assert again.viewpoints.orbit == lone.viewpoints.orbit and len(again.viewpoints.clear([looking(4.0)])) == 1
+    gc.disable()
+    try:
+        known = weakref.ref(lone)
+        del lone
+        assert known() is None
+    finally:
+        gc.enable()
+
+
+def test_a_model_is_looked_at_with_the_detail_that_its_views_show(monkeypatch):
+    wrapped, zooms = wrap_model(VanillaModel.from_gaussians(scene(floater=0.04)), backend="reference"), []
+    clear, splats = wrapped.viewpoints.clear, wrapped.model.gaussians(looking(-4.0))
+    monkeypatch.setattr(wrapped.model, "traits", replace(wrapped.model.traits, same_for_all_views=False), raising=False)
+    monkeypatch.setattr(wrapped.model, "gaussians", lambda view: zooms.append(view.zoom) or splats)
+    assert clear([looking(-4.0)]) and zooms == [1]

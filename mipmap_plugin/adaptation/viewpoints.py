@@ -63,8 +63,8 @@ class Viewpoints:
 class ClearViews:
     """Finds the views that see a model clearly. Each is looked at once."""
 
-    def __init__(self, model: SplatModel, backend: Callable[[], Backend], effects: Effects) -> None:
-        """`backend`: of what draws the model; `effects`: how the model is rendered at its own scale."""
+    def __init__(self, model: SplatModel, backend: Callable[[], tuple[Backend, str]], effects: Effects) -> None:
+        """`backend`: chooses what draws the model (`choose_backend`); `effects`: how the model is rendered at its own scale."""
         self._model, self._backend = model, backend
         settings = effects.settings.without_color_rounding()
         self._effects = replace(effects, sh_degree=0, background=(0.0, 0.0, 0.0), settings=settings)
@@ -75,7 +75,9 @@ class ClearViews:
         """Those of the views that see the model clearly. All of a model whose splats have covariances instead of scales."""
         unknown = [view for view in views if _key(view) not in self._known]
         if unknown:
-            small, backend = [view.zoomed(LOOK / min(view.size)) for view in unknown], self._backend()
+            # With the zoom of the views, so that a model shows as many splats as in these.
+            small = [replace(view.zoomed(LOOK / min(view.size)), zoom=view.zoom) for view in unknown]
+            backend, _ = self._backend()
             once = self._model.gaussians(unknown[0]) if self._model.traits.same_for_all_views else None
             threads = max_threads(self._model.parameters()["means"], small[0])
             shown = side_by_side(lambda view: self._is_clear(view, backend, once), small, threads)
