@@ -62,9 +62,7 @@ class RenderOptions(TypedDict, total=False):
 class FrozenBase:
     """A frozen base model with its cameras: what levels build on. `wrap.Wrapped` can make them, too."""
 
-    def __init__(
-        self, model: SplatModel, cameras: Sequence[Camera], backend: str, trained: TrainedScale, threads: int | None = None
-    ) -> None:
+    def __init__(self, model: SplatModel, cameras: Sequence[Camera], backend: str, trained: TrainedScale, threads: int | None = None) -> None:
         self.model, self.cameras, self._backend, self.trained, self.threads = model, list(cameras), backend, trained, threads
         self.background = trained.background or (0.0, 0.0, 0.0)
         self.loading_s = 0.0  # seconds that loading the model took
@@ -275,8 +273,8 @@ class FrozenBase:
     @cached_property
     def viewpoints(self) -> Viewpoints:
         """Where views without cameras are. Raises SettingsError without splats."""
-        backend = partial(choose_backend, self._backend, self._needs)  # which does not refer to this base, and so keeps no memory
-        return Viewpoints(orbit_of(self.model, self.trained.up), ClearViews(self.model, backend, self.effects()))
+        clear = ClearViews(self.model, partial(choose_backend, self._backend, self._needs), self.effects())
+        return Viewpoints(orbit_of(self.model, self.trained.up), clear)
 
     def refuse_undrawn(self, views: Sequence[Camera] | None = None, scale: float = 1.0) -> None:
         """Raise SettingsError if none of the views, by default the base's own, shows anything of it at `scale` (`refuse_blind`)."""

@@ -12,6 +12,7 @@ import torch
 from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation.viewpoints import FOG, ROUNDS, ClearViews, Viewpoints
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.evaluation.measure import adapt_alone
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes.orbits import Orbit
 
@@ -89,14 +90,21 @@ def test_each_view_is_looked_at_once():
     assert len(clear([looking(-4.0)])) == len(clear([looking(-4.0)])) == len(asked) == 1
 
 
+def lone_capture():
+    """A capture without cameras."""
+    splats = scene(floater=0.04)
+    far = torch.cat([splats.means[:-60], 40 * torch.randn(60, 3, generator=torch.Generator().manual_seed(0))])
+    return wrap_model(VanillaModel.from_gaussians(replace(splats, means=far)))
+
+
 @pytest.mark.filterwarnings("ignore:no cameras are known")
 def test_choosing_views_takes_a_phase_of_its_own():
-    splats = scene(floater=0.04)
-    far = replace(splats, means=torch.cat([splats.means[:-60], 40 * torch.randn(60, 3, generator=torch.Generator().manual_seed(0))]))
-    lone = wrap_model(VanillaModel.from_gaussians(far), backend="reference")
+    lone = lone_capture()
     report = lone.adapt(1 / 4, recipe="instant", extra_views=2).report
     assert lone.viewpoints.orbit.nearest and 0 < report.seconds["views"] < report.seconds["total"]
     assert "views" not in lone.adapt(1 / 4, recipe="instant", cameras=tiny.cameras(2)).report.seconds
+    seconds = lone.adapt(1, recipe="instant", extra_views=2).report.seconds
+    assert 0 < seconds["compilation"] + seconds["views"] == pytest.approx(seconds["total"])  # at scale 1 nothing else is done
 
 
 @pytest.mark.filterwarnings("ignore:no cameras are known")
@@ -120,3 +128,13 @@ def test_a_model_is_looked_at_with_the_detail_that_its_views_show(monkeypatch):
     monkeypatch.setattr(wrapped.model, "traits", replace(wrapped.model.traits, same_for_all_views=False), raising=False)
     monkeypatch.setattr(wrapped.model, "gaussians", lambda view: zooms.append(view.zoom) or splats)
     assert clear([looking(-4.0)]) and zooms == [1]
+
+
+@pytest.mark.filterwarnings("ignore:no cameras are known")
+def test_where_the_time_is_measured_views_are_looked_at_again(monkeypatch):
+    looked, is_clear = [], ClearViews._is_clear
+    monkeypatch.setattr(ClearViews, "_is_clear", lambda self, view, *rest: looked.append(view.name) or is_clear(self, view, *rest))
+    lone = lone_capture()
+    for _ in range(2):
+        adapt_alone(lone, 1 / 4, recipe="instant", extra_views=2)
+    assert len(looked) > 0 and looked[: len(looked) // 2] == looked[len(looked) // 2 :]

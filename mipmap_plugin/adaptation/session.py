@@ -68,6 +68,7 @@ class Session:
         self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.device)
         self._has_photographs, self._orbits = real is not None, not cameras or config.views == "orbit"
         self.base_views, validation, self.views_note = self._choose_views(cameras)
+        self.seconds["total"] = sum(self.seconds.values())
         self._closest_of = cameras if scale > 1 and cameras else self.base_views  # a zoom-in is as fine as what the base was seen from
         self.views = over_band(self.base_views, config)
         self.views_note += f", {real.note(self.base_views)}" if real else ""
@@ -113,7 +114,7 @@ class Session:
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
         for remark in filter(None, [*remarks(self.base_views, self.base, near, orbit=self._orbits), too_unlike(self.base_views)]):
             warn(remark)
-        began = now(self.device) - sum(self.seconds.values())
+        began = now(self.device) - self.seconds["total"]
         self._compile()
         evaluate_moments(self.base, [*self.views, *self.validation.steering], self.phase)
         search = StartSearch(self._start_problem())

@@ -64,7 +64,10 @@ class ClearViews:
     """Finds the views that see a model clearly. Each is looked at once."""
 
     def __init__(self, model: SplatModel, backend: Callable[[], tuple[Backend, str]], effects: Effects) -> None:
-        """`backend`: chooses what draws the model (`choose_backend`); `effects`: how the model is rendered at its own scale."""
+        """`effects`: how the model is rendered at its own scale.
+
+        `backend`: chooses what draws the model (`choose_backend`); a reference to the base, which has this, would keep its memory.
+        """
         self._model, self._backend = model, backend
         settings = effects.settings.without_color_rounding()
         self._effects = replace(effects, sh_degree=0, background=(0.0, 0.0, 0.0), settings=settings)

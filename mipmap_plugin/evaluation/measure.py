@@ -132,8 +132,9 @@ def warm_up(model: Wrapped, scale: float, cameras: Sequence[Camera]) -> None:
 
 
 def adapt_alone(model: Wrapped, scale: float, **options: Any) -> Adapted:
-    """Adapt as the first call does: the seconds include every base image, whatever earlier calls have drawn. `options`: of `adapt`."""
+    """Adapt as the first call does: the seconds include every image of the base, whatever earlier calls have drawn. `options`: of `adapt`."""
     model.images = None
+    vars(model).pop("viewpoints", None)  # which views are clear
     return model.adapt(scale, **options)
 
 
