@@ -10,8 +10,10 @@ import tiny
 import torch
 
 from mipmap_plugin import wrap_model
-from mipmap_plugin.adaptation.viewpoints import FOG, ROUNDS, ClearViews, Viewpoints
+from mipmap_plugin.adaptation.optimization.amount import DRAWS_A_SECOND, FOR_LOOKS, looks_in_budget
+from mipmap_plugin.adaptation.viewpoints import FOG, LEAST_LOOKS, ROUNDS, ClearViews, Viewpoints
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.evaluation.measure import adapt_alone
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes.orbits import Orbit
@@ -40,6 +42,33 @@ def test_where_few_are_clear_there_are_few_and_where_none_is_there_are_all():
     assert found.name in tried and len(set(tried)) == ROUNDS * COUNT
     with pytest.warns(UserWarning, match="no generated view sees this capture clearly"):
         assert len(views_of(CAPTURE, lambda view: False)) == COUNT
+
+
+def looked_at(share, count, looks=float("inf")):
+    """How many views are looked at of which so large a share is clear, and how many are found."""
+    tried = []
+
+    def clear(views):
+        tried.extend(views)
+        return views[: round(share * len(views))]
+
+    found = Viewpoints(CAPTURE, clear, looks).views((8, 8), count, torch.Generator().manual_seed(0))
+    return len(tried), len(found)
+
+
+def test_not_many_more_are_looked_at_than_are_wanted():
+    assert looked_at(0.8, 100) == (125, 100)
+
+
+@pytest.mark.parametrize(("looks", "expected"), [(40.5, (40, 20)), (110, (110, 55)), (LEAST_LOOKS - 1, (0, 100)), (500, (200, 100))])
+def test_a_budget_bounds_how_many_are_looked_at(looks, expected):
+    assert looked_at(0.5, 100, looks) == expected
+
+
+def test_looks_follow_from_the_budget_and_the_splats():
+    model = tiny.model(50)
+    assert looks_in_budget(AdaptConfig(), model) == float("inf")
+    assert looks_in_budget(AdaptConfig(time_budget_s=2.0), model) == FOR_LOOKS * 2.0 * DRAWS_A_SECOND / 50
 
 
 def test_an_object_is_looked_at_from_all_around():

@@ -7,7 +7,7 @@ import json
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from mipmap_plugin.adaptation.adapted import Adapted
@@ -15,7 +15,7 @@ from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch
 from mipmap_plugin.adaptation.following import Following, release
 from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_trained, psnr_per_viewer
 from mipmap_plugin.adaptation.moments import at_their_moments, evaluate_moments
-from mipmap_plugin.adaptation.optimization.amount import affordable_for_model, affordable_moments, fewer_note, takes_steps
+from mipmap_plugin.adaptation.optimization.amount import affordable_for_model, affordable_moments, fewer_note, looks_in_budget, takes_steps
 from mipmap_plugin.adaptation.optimization.budget import no_steps_notes, plan_note, within_budget
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.growing import growth_note
@@ -64,7 +64,8 @@ class Session:
         self.effects, self.extremes = next(iter(self.targets.values())), extreme_targets(self.targets)
         self.asked = fitting(config, self.base_effects)
         self.config = config = affordable_for_model(self.asked, self.base, cameras, self.effects.near_plane)
-        self.device, self.viewpoints = self.base.parameters()["means"].device, request.viewpoints
+        self.device = self.base.parameters()["means"].device
+        self.viewpoints = replace(request.viewpoints, looks=looks_in_budget(config, self.base))
         self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.device)
         self._has_photographs, self._orbits = real is not None, not cameras or config.views == "orbit"
         self.base_views, validation, self.views_note = self._choose_views(cameras)

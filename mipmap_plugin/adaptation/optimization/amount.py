@@ -32,8 +32,17 @@ FOR_MOMENTS_IN_BUDGET, LEAST_IN_BUDGET = 1 / 6, 2
 # as many views as without a budget would take a quarter of a run of two seconds.
 VALIDATED_A_SECOND = 1e5
 
+# The part of a time budget that looking at views may take, to find those that see a capture clearly.
+FOR_LOOKS = 1 / 4
+
 # The base is drawn so many times finer than the target at most.
 OVERSAMPLING = 3
+
+
+def looks_in_budget(config: AdaptConfig, base: SplatModel) -> float:
+    """How many views of a model a time budget allows to look at (`viewpoints.Viewpoints`)."""
+    budget = math.inf if config.time_budget_s is None else FOR_LOOKS * config.time_budget_s
+    return budget * DRAWS_A_SECOND / max(1, len(base.parameters()["means"]))
 
 
 @torch.no_grad()
