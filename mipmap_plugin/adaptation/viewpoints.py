@@ -34,10 +34,9 @@ ROUNDS = 4
 # Where a time budget allows to look at fewer, any view is taken.
 LEAST_LOOKS = 16
 
-UNCLEAR = (
-    "no generated view sees this capture clearly: all look through fog or walls, or at nothing, and are taken as they are; "
-    "give the scene's cameras (--cameras), or adapt for what you look at (mipmap-plugin view)"
-)
+INSTEAD = "give the scene's cameras (--cameras), or adapt for what you look at (mipmap-plugin view)"
+UNCLEAR = f"no generated view that was looked at sees this capture clearly, only through fog or walls, or nothing: any are taken; {INSTEAD}"
+HURRIED = f"the time budget leaves no time to look for views that see this capture clearly: any are taken; give more, or {INSTEAD}"
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,10 @@ class Viewpoints:
     def views(self, size: tuple[int, int], count: int, generator: torch.Generator) -> list[Camera]:
         """`count` views of `size` (height, width) px. Of a capture they are clear: fewer where fewer are, and any, with a warning, where none is."""
         first = self.orbit.views(size, count, generator)
-        if not self.orbit.nearest or self.looks < min(count, LEAST_LOOKS):
+        if not self.orbit.nearest:
+            return first
+        if self.looks < min(count, LEAST_LOOKS):
+            warn(HURRIED)
             return first
         looked_at = evenly(first, int(min(self.looks, count)))
         found, tried = self.clear(looked_at), len(looked_at)

@@ -28,7 +28,7 @@ def views_for_screen(base: Wrapped, screen: Camera, look_at: Tensor, scale: floa
     """Views of the base's scale to adapt to for what `screen`, a camera of the new scale, shows around the point `look_at` [3]."""
     means = base.model.parameters()["means"].detach()
     near = [part(turned(screen, look_at, number), means, scale, number).zoomed(1 / scale) for number in range(NEAR)]
-    given = base.cameras or base.viewpoints.best(base.views())
+    given = base.cameras or base.viewpoints.best(evenly(base.views(), OWN))
     train = [view for view in given if view.split == "train"] or given
     own = [middle(view, scale) for view in evenly(train, OWN)]
     return [replace(view, name=f"screen_{number}", zoom=1.0, index=own[0].index) for number, view in enumerate(near)] + own

@@ -12,7 +12,7 @@ from typing import Any
 
 from torch import Tensor
 
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.errors import MipmapPluginError, SettingsError
 from mipmap_plugin.limits import is_out_of_memory
 from mipmap_plugin.viewing.adapting import Adapter, Live, Wish
@@ -24,6 +24,9 @@ from mipmap_plugin.viewing.sources import File, of_adapted
 from mipmap_plugin.viewing.stage import Look, Stage, smaller
 
 OUT_OF_MEMORY = "out of memory; enlarge pixels, or make the window smaller"
+
+# Views of an orbit that are looked at to find one to begin with, before the page is there.
+LOOKED_AT = 16
 
 # Of JPEG, while the camera moves; pictures that stay are PNGs, whose pixels are exact.
 QUALITY = 80
@@ -104,7 +107,7 @@ class Page:
         base, views = self._stage.base, list(self._views.values())
         view = views[0]
         if not base.cameras:  # an orbit begins high above, and a capture's with views through its walls
-            best = base.viewpoints.best(views)
+            best = base.viewpoints.best(evenly(views, LOOKED_AT))
             view = best[len(best) // 2]
         first, moment = self._pose(view), view.time or 0.0 if self._stage.base.model.traits.moves else None
         self._controls = Controls(server.gui, self._names(), viewers, list(self._views), settings.recipes, moment)
