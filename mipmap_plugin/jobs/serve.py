@@ -65,9 +65,9 @@ def _run_quietly(job: Job, threads: int | None) -> Outcome:
         warnings.simplefilter("ignore")
         warnings.filterwarnings("default", module=r"mipmap_plugin(\.|$)")
         try:
-            with _interruptible():
-                from mipmap_plugin.jobs.run import run  # loads torch, which takes a second that Ctrl-C may come in
+            from mipmap_plugin.jobs.run import run  # not interruptible: what it loads, torch among it, may swallow a KeyboardInterrupt
 
+            with _interruptible():
                 outcome = run(job, threads)
         except KeyboardInterrupt as interrupt:
             outcome = Outcome(job, "interrupted", reason=str(interrupt) or "interrupted")
