@@ -63,7 +63,7 @@ def test_merged_splats_keep_their_shapes_where_the_filter_alone_is_better(monkey
         Splats, base.cameras, base.cameras, 1 / 4, antialiased, antialiased, config, ReferenceBackend(), True,
         lambda model: Quality(*[30.0 if model not in reshaped else formed_db] * 2), lambda _: torch.no_grad(),
     )  # fmt: skip
-    monkeypatch.setattr(candidates.StartSearch, "_base_weights", lambda *_: torch.ones(100))
+    monkeypatch.setattr(candidates.BaseWeights, "measured", lambda *_: torch.ones(100))
     monkeypatch.setattr(candidates.StartSearch, "_merge", lambda *_: torch.ones(50))
     best, name = candidates.StartSearch(problem).best()
     assert (best in reshaped) == forms and name == ("the closed form of merged splats" if forms else "merged splats")

@@ -10,7 +10,7 @@ import tiny
 from mipmap_plugin.adaptation.conversion import conversion
 from mipmap_plugin.adaptation.optimization.budget import Pace
 from mipmap_plugin.adaptation.session import Session
-from mipmap_plugin.adaptation.start import candidates
+from mipmap_plugin.adaptation.start import base_weights
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
@@ -86,7 +86,7 @@ def test_the_first_stage_is_forgotten_before_the_second(monkeypatch):
 
 
 def test_what_no_view_shows_is_told_once_and_of_the_base(monkeypatch):
-    monkeypatch.setattr(candidates, "HIDDEN", -1.0)  # each start would tell of it
+    monkeypatch.setattr(base_weights, "HIDDEN", -1.0)  # each start would tell of it
     with pytest.warns(UserWarning, match="no view shows") as said:
         report = wrapped().adapt(2, viewer="antialiased", **BRIEF).report
     assert ["no view shows" in str(warning.message) for warning in said].count(True) == 1

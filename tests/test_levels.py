@@ -151,7 +151,7 @@ def test_what_is_merged_too_coarsely_leaves_the_choice_to_plain_merging(monkeypa
         base=lambda: Base(["finer"]), coarse_base=lambda: Base(["base"]), config=config, quality=quality, may_lose=9.0, name="the finer level",
         views=[], scale=0.5, phase=lambda _: nullcontext(), base_effects=Effects(0), target=Effects(0), has_blend_weights=False,
     )  # fmt: skip
-    monkeypatch.setattr(candidates.StartSearch, "_base_weights", lambda *_: None)
+    monkeypatch.setattr(candidates.BaseWeights, "measured", lambda *_: None)
     monkeypatch.setattr(candidates.StartSearch, "_candidate", candidate)
     assert candidates.StartSearch(problem).best()[0] == start
 

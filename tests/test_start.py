@@ -10,8 +10,7 @@ from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
 from mipmap_plugin.adaptation.parallel import VIEWS_AT_ONCE
 from mipmap_plugin.adaptation.pixel_size import mean_pixel_size, pixel_size
 from mipmap_plugin.adaptation.report import AS_IT_IS, UNCHANGED, Report
-from mipmap_plugin.adaptation.start import candidates as start
-from mipmap_plugin.adaptation.start import compilation
+from mipmap_plugin.adaptation.start import base_weights, candidates, compilation
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.closed_form import closed_form
 from mipmap_plugin.backends.base import Calls
@@ -73,7 +72,7 @@ def test_a_start_takes_no_memory_for_what_it_has_of_the_base_and_what_is_returne
 
 
 def test_the_base_is_chosen_where_the_closed_form_is_worse(monkeypatch):
-    monkeypatch.setattr(start, "closed_form", lambda gaussians, *_: (10 * gaussians.scales, gaussians.opacities))
+    monkeypatch.setattr(candidates, "closed_form", lambda gaussians, *_: (10 * gaussians.scales, gaussians.opacities))
     result = adapted(scale=4)
     assert start_of(result.report) == "the base"
     assert torch.equal(result.model.parameters()["scales"], tiny.model(COUNT).parameters()["scales"])
@@ -88,7 +87,7 @@ def test_crispness_reaches_the_start():
 @pytest.mark.parametrize(("scale", "size"), [(2, mean_pixel_size), (1 / 2, pixel_size)])
 def test_a_zoom_in_is_formed_for_the_mean_of_the_views(scale, size, monkeypatch):
     forms = []
-    monkeypatch.setattr(start, "closed_form", lambda *arguments: forms.append(arguments[-1]) or closed_form(*arguments))
+    monkeypatch.setattr(candidates, "closed_form", lambda *arguments: forms.append(arguments[-1]) or closed_form(*arguments))
     adapted(scale=scale, extra_views=0)
     assert torch.equal(forms[0].pixel, size(tiny.model(COUNT).parameters()["means"], tiny.cameras()))
 
@@ -224,6 +223,48 @@ def test_a_start_that_takes_the_whole_time_budget_merges_nothing_and_the_report_
     assert whole.seconds["merging"] > 0 and whole.ended_by == "5 steps"
 
 
+@pytest.fixture
+def no_time_to_search(monkeypatch):
+    """The counts of splats whose closed form is computed, where a time budget is too short for a search; the base is worse than anything."""
+    formed = []
+
+    def form(gaussians, *rest):
+        formed.append(len(gaussians))
+        return closed_form(gaussians, *rest)
+
+    monkeypatch.setattr(candidates, "closed_form", form)
+    monkeypatch.setattr(candidates, "SEARCH_PART", -1.0)
+    monkeypatch.setattr(Validation, "quality", lambda self, model: Quality(*[-float(len(model))] * 2))
+    return formed
+
+
+IN_TIME = {"time_budget_s": 1000.0, "steps": 2, "merge_to": 0.25}
+
+
+def test_a_budget_too_short_for_a_search_begins_with_what_is_merged_furthest(no_time_to_search, monkeypatch):
+    monkeypatch.setattr(candidates, "REACHED", 3.5)
+    report = adapted(**IN_TIME).report
+    assert start_of(report) == "the closed form of merged splats"
+    assert no_time_to_search == [report.gaussians_after] and report.gaussians_after < COUNT
+
+
+@pytest.mark.parametrize(
+    ("reached", "settings"),
+    [(1.0, {}), (3.5, {"merge_to": 0.3}), (3.5, {"steps": 0}), (3.5, {"time_budget_s": None})],
+    ids=["splats that can hardly be merged", "few fewer splats", "no steps", "no budget"],
+)
+def test_otherwise_the_base_is_formed_first(no_time_to_search, monkeypatch, reached, settings):
+    monkeypatch.setattr(candidates, "REACHED", reached)
+    adapted(**IN_TIME | settings)
+    assert no_time_to_search[0] == COUNT
+
+
+def test_merged_splats_that_are_worse_than_the_base_are_not_begun_with_in_a_short_budget_either(no_time_to_search, monkeypatch):
+    monkeypatch.setattr(candidates, "REACHED", 3.5)
+    monkeypatch.setattr(Validation, "quality", lambda self, model: Quality(*[float(len(model))] * 2))
+    assert start_of(adapted(**IN_TIME).report) == "the closed form"
+
+
 def test_phases_are_named():
     seconds = adapted(merge_to=0.5).report.seconds
     phases = ["compilation", "blend weights", "closed form", "merging", "validation"]
@@ -255,12 +296,12 @@ def test_steps_of_more_views_than_are_drawn_at_once_take_autograds_way(views, by
 
 def test_a_start_is_computed_from_as_many_views_as_show_enough(monkeypatch):
     """By what they show: splats behind others do not count."""
-    counts, real = [], start.weighed
+    counts, real = [], base_weights.weighed
 
     def weighed(gaussians, views, *rest):
         counts.append(len(views))
         return real(gaussians, views, *rest)[0], 0.2 if len(counts) == 1 else 1.0
 
-    monkeypatch.setattr(start, "weighed", weighed)
+    monkeypatch.setattr(base_weights, "weighed", weighed)
     wrap_model(tiny.model(COUNT), cameras=tiny.cameras(60)).adapt(SCALE, recipe="instant", extra_views=0)
-    assert counts == [12, 48]
+    assert counts == [12, 36]  # the further ones of 48

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.validation import Quality
-from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS, mean_pixel_size, pixel_size, views_for
-from mipmap_plugin.adaptation.start.blend_weights import blend_weights, may_show, weighed, whole_weights
+from mipmap_plugin.adaptation.pixel_size import mean_pixel_size
+from mipmap_plugin.adaptation.start.base_weights import BaseWeights
+from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.clock import Clock
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import ROUNDS, matched_opacities
@@ -24,7 +25,6 @@ from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, Thinned
 from mipmap_plugin.models.contract import rebuild, reshape
-from mipmap_plugin.render_settings import MIN_ALPHA
 from mipmap_plugin.screen_filters import INTEGRATED
 
 # The powers of `merge_to` that are tried: the last, the mildest, and then the others, until merging loses little enough.
@@ -44,8 +44,12 @@ COARSE_COSTS = 3.0
 # The fraction of a time budget that the start may take: what it would not finish in it is left out, from the strongest merging on.
 START_SHARE = 0.5
 
-# The user is told where no view shows more than this fraction of the splats, for dB say nothing of them. Captures have up to a quarter.
-HIDDEN = 1 / 3
+# Merging that leaves this fraction of the splats at most makes steps so much faster that in a time budget too short for a search it is begun with, if
+# no more than so many times the fraction are left: objects then gain 1 to 5 dB. Captures keep 1.7 times the fraction and more, and would lose 1 to 5.
+FAR_FEWER, REACHED = 1 / 4, 1.5
+
+# The part of a start's time in which a search has to end that begins all the same: whole runs spend less of theirs.
+SEARCH_PART = 1 / 4
 
 
 class Bounds(NamedTuple):
@@ -83,14 +87,11 @@ class StartSearch:
 
     def __init__(self, problem: StartProblem) -> None:
         self._problem, self._rounds = problem, Rounds()
-        self._count: int | None = None  # of the views that show enough of the splats; None as long as it is not known
-        self._of_base: tuple[Tensor, Tensor] | None = None  # the base's means and its pixel size
-        self._shown = torch.empty(0, dtype=torch.bool)  # of the base's splats (`may_show`), once blend weights are known
         self._least = 0.0  # fraction of the rows that stay
-        self._size = 1.0  # fraction of their size at which views are weighed: less where a time budget leaves no time for large ones
-        self.notes: list[str] = []  # on what the views show of the base
         budget, device = problem.config.time_budget_s, problem.base().parameters()["means"].device
         self._clock = Clock(START_SHARE * budget if budget else math.inf, device)
+        self._seen = BaseWeights(problem, self._clock)
+        self.notes = self._seen.notes
         self._alike = draws_alike(problem.base_effects, problem.target)
         # The steps of a zoom-out end 0.2 dB higher from the base's own shapes (lego and chair, x1/4).
         keeps = self._alike and problem.config.steps > 0 and problem.scale <= 1
@@ -109,9 +110,11 @@ class StartSearch:
             return base, problem.name
         with problem.phase("blend weights"):
             merges = config.merge_to < 1 and not base.traits.thins
-            weights = self._base_weights(base) if self._matches_weights or merges or too_many else None
+            weights = self._seen.measured(base) if self._matches_weights or merges or too_many else None
         if too_many:
             return self._candidate(weights, 0.0), start_name(self._forms, merged=True)
+        if (merged := self._merged_at_once(weights)) is not None:
+            return merged, start_name(self._forms, merged=True)
         with self._clock.timing("candidate"):
             formed = self._candidate(weights, 1.0)
         if config.merge_to == 1 and config.returns == "last":
@@ -126,6 +129,25 @@ class StartSearch:
         if merged is not None:
             return merged, start_name(self._forms, merged=True, thinned=base.traits.thins)
         return (formed, start_name(True)) if self._forms and after.visible >= before.visible else (base, problem.name)
+
+    def _merged_at_once(self, weights: Tensor | None) -> SplatModel | None:
+        """What is merged furthest, where a time budget is too short for a search and that betters the base; else None."""
+        problem, student, fraction = self._problem, self._problem.base(), self._fraction(1)
+        if not self._clock.limited or weights is None or student.traits.thins or problem.coarse_base is not None:
+            return None
+        if fraction > FAR_FEWER or not problem.config.steps:
+            return None
+        with problem.phase("merging"):
+            new_weights = self._merge(student, weights, fraction, coarsely=False)
+        left = len(new_weights) / len(weights)
+        if left > REACHED * fraction:
+            return None
+        least = problem.quality(problem.base()).visible - problem.may_lose
+        with self._clock.timing("form", left):
+            self._form(student, new_weights)
+            quality = problem.quality(student)
+        searches = self._clock.allows("form", 1 + self._fraction(POWERS[-1]), SEARCH_PART)
+        return None if searches or quality.visible < least else student
 
     def _least_psnr(self, formed: Quality) -> float:
         """What merging has to leave of the PSNR of the closed form: of a level that no step betters, half of what it gains on the base."""
@@ -186,23 +208,27 @@ class StartSearch:
         elif fraction < 1 and student.traits.thins:
             with problem.phase("thinning"):
                 means = student.parameters()["means"].detach()
-                cast(Thinned, student).thin(evenly_in_space(means, self._pixel_size(means) / problem.scale, fraction))
-        if self._forms:
-            with problem.phase("closed form"):
-                reshape(student, lambda gaussians: self._closed_form(gaussians, weights), problem.views)
+                cast(Thinned, student).thin(evenly_in_space(means, self._seen.pixel_size(means) / problem.scale, fraction))
+        self._form(student, weights)
         return student
+
+    def _form(self, student: SplatModel, weights: Tensor | None) -> None:
+        """Give the student's splats, which have these blend weights, the closed form."""
+        if self._forms:
+            with self._problem.phase("closed form"):
+                reshape(student, lambda gaussians: self._closed_form(gaussians, weights), self._problem.views)
 
     def _merge(self, student: SplatModel, weights: Tensor, fraction: float, coarsely: bool) -> Tensor:
         """Merge the student's splats down to a fraction of them, or to `most_splats`; return the blend weights of the merged splats."""
         problem, merged_weights = self._problem, []
 
         def pixel_of(means: Tensor) -> Tensor:
-            return self._pixel_size(means) / problem.scale
+            return self._seen.pixel_size(means) / problem.scale
 
         def merged(gaussians: Gaussians) -> Gaussians:
             most = problem.config.most_splats or (math.ceil(fraction * len(gaussians)) if coarsely else None)
             if most is None:
-                splats, new_weights = merge_seen(gaussians, pixel_of(gaussians.means), weights, fraction, self._shown, self._rounds)
+                splats, new_weights = merge_seen(gaussians, pixel_of(gaussians.means), weights, fraction, self._seen.shown, self._rounds)
             else:
                 splats, new_weights = merge_down(gaussians, pixel_of, weights, most)
             merged_weights.append(new_weights)
@@ -215,21 +241,21 @@ class StartSearch:
         """Scales [N, 3] and opacities [N] in closed form, with opacities that match the blend weights where these are known."""
         problem, rounds = self._problem, self._matching_rounds(weights)
         area_power = 1.0 if rounds else AREA_POWER
-        pixel = self._pixel_size(gaussians.means)
-        formed_for = mean_pixel_size(gaussians.means, problem.closest_of, self._count) if problem.scale > 1 else pixel
-        settings = FormSettings(area_power, problem.config.crispness, self._count, formed_for, matched=rounds > 0)
+        pixel = self._seen.pixel_size(gaussians.means)
+        formed_for = mean_pixel_size(gaussians.means, problem.closest_of, self._seen.count) if problem.scale > 1 else pixel
+        settings = FormSettings(area_power, problem.config.crispness, self._seen.count, formed_for, matched=rounds > 0)
         scales, opacities = closed_form(gaussians, problem.views, problem.scale, problem.base_effects, problem.target, settings)
         if weights is None or not rounds:
             return scales, opacities
-        size = min(self._size, problem.scale)  # a zoom-in is weighed in images of the base's size: sums over pixels need no finer ones
+        size = min(self._seen.size, problem.scale)  # a zoom-in is weighed in images of the base's size: sums over pixels need no finer ones
         finer = problem.scale / size
         target = replace(problem.target, eps2d=problem.target.eps2d / finer**2, settings=problem.target.settings.finer(1 / finer))
-        views = [view.zoomed(size) for view in evenly(problem.views, self._count)]
+        views = [view.zoomed(size) for view in evenly(problem.views, self._seen.count)]
 
         def weights_of(opacities: Tensor) -> Tensor:
             return blend_weights(replace(gaussians, scales=scales, opacities=opacities), views, problem.backend, target) * finer**2
 
-        return scales, matched_opacities(opacities, weights, self._whole_weights(gaussians, pixel), weights_of, rounds)
+        return scales, matched_opacities(opacities, weights, self._seen.whole(gaussians, pixel), weights_of, rounds)
 
     def _matching_rounds(self, weights: Tensor | None) -> int:
         """How many rounds opacities are matched in: none without blend weights, and no more than there is time for."""
@@ -239,40 +265,3 @@ class StartSearch:
         if rounds == 0 < wanted and UNMATCHED not in self.notes:
             self.notes.append(UNMATCHED)
         return rounds
-
-    def _whole_weights(self, gaussians: Gaussians, pixel: Tensor) -> Tensor:
-        problem = self._problem
-        return whole_weights(gaussians, pixel, problem.views, problem.base_effects, problem.scale)
-
-    def _pixel_size(self, means: Tensor) -> Tensor:
-        """`pixel_size`; that of the base, which is asked for first, serves all candidates."""
-        if self._of_base is not None and torch.equal(self._of_base[0], means):
-            return self._of_base[1]
-        pixels = pixel_size(means, self._problem.closest_of, self._count)
-        self._of_base = self._of_base or (means, pixels)
-        return pixels
-
-    def _base_weights(self, base: SplatModel) -> Tensor:
-        """[N]: the blend weights of the base's splats, in target pixels of a view, from as many views as show enough of them."""
-        problem, gaussians = self._problem, base.gaussians(self._problem.views[0]).detach()
-
-        def over(count: int, size: float) -> tuple[Tensor, float]:
-            return weighed(gaussians, evenly(problem.views, count), problem.backend, problem.base_effects, size)
-
-        self._size = self._clock.size(problem.views[0], LEAST_VIEWS, lambda size: over(1, size))
-        with self._clock.timing("weights"):
-            weights, shown = over(LEAST_VIEWS, self._size)
-        self._count = views_for(shown)
-        while self._count > LEAST_VIEWS and not self._clock.allows("weights", self._count / LEAST_VIEWS):
-            self._count //= 2
-        if self._count > LEAST_VIEWS:
-            with self._clock.timing("weights"):
-                weights, _ = over(self._count, self._size)
-        weights = weights * problem.scale**2
-        whole, looked_at = self._whole_weights(gaussians, self._pixel_size(gaussians.means)), evenly(problem.views, self._count)
-        self._shown = may_show(weights, whole, gaussians.means, problem.views, looked_at)
-        drawn = gaussians.opacities >= MIN_ALPHA
-        if (hidden := float((~self._shown)[drawn].float().mean())) > HIDDEN:
-            advice = "give cameras that show all of the scene, or look at it from where these do"
-            self.notes.append(f"no view shows {hidden:.0%} of the splats, of which the dB say nothing: {advice}")
-        return weights

@@ -21,7 +21,7 @@ class Clock:
 
     def __init__(self, seconds: float, device: torch.device) -> None:
         self._device, self._took = device, dict[str, float]()
-        self._end = now(device) + seconds
+        self._began, self._seconds = now(device), seconds
 
     @contextmanager
     def timing(self, work: str, amount: float = 1.0) -> Iterator[None]:
@@ -30,16 +30,24 @@ class Clock:
         yield
         self._took[work] = (now(self._device) - began) / amount
 
-    def allows(self, work: str, amount: float = 1.0) -> bool:
-        """Whether there is time for an amount of a work."""
-        return now(self._device) + amount * self._took.get(work, 0.0) <= self._end
+    @property
+    def limited(self) -> bool:
+        """Whether the time ends at all."""
+        return not math.isinf(self._seconds)
+
+    def allows(self, work: str, amount: float = 1.0, part: float = 1.0) -> bool:
+        """Whether there is time for an amount of a work; `part`: in that part of the time, from its beginning on."""
+        return self._spent() + amount * self._took.get(work, 0.0) <= part * self._seconds
 
     def size(self, view: Camera, count: int, weigh: Callable[[float], object]) -> float:
         """The fraction of its size at which so many views like `view` can be weighed; `weigh(fraction)` does it with one."""
         least = LEAST_SIDE / math.sqrt(view.width * view.height)
-        if least >= 1 or math.isinf(self._end):
+        if least >= 1 or not self.limited:
             return 1.0
         with self.timing("trial"):
             weigh(least)
-        possible = WEIGHING * (self._end - now(self._device)) / (count * self._took["trial"])  # views of the least size, in place of each
+        possible = WEIGHING * (self._seconds - self._spent()) / (count * self._took["trial"])  # views of the least size, in place of each
         return min(1.0, least * math.sqrt(max(1.0, possible)))
+
+    def _spent(self) -> float:
+        return now(self._device) - self._began

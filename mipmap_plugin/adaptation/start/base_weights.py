@@ -1,0 +1,73 @@
+"""What its views show of the base: the sizes of their pixels, and how much each splat contributes to their images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS, pixel_size, views_for
+from mipmap_plugin.adaptation.start.blend_weights import may_show, weighed, whole_weights
+from mipmap_plugin.adaptation.start.clock import Clock
+from mipmap_plugin.adaptation.start.problem import StartProblem
+from mipmap_plugin.camera import evenly
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.render_settings import MIN_ALPHA
+
+# The user is told where no view shows more than this fraction of the splats, for dB say nothing of them. Captures have up to a quarter.
+HIDDEN = 1 / 3
+
+
+class BaseWeights:
+    """The blend weights of the base's splats, and by which views they are known. Before `measured` only pixel sizes are."""
+
+    def __init__(self, problem: StartProblem, clock: Clock) -> None:
+        self._problem, self._clock = problem, clock
+        self._of_base: tuple[Tensor, Tensor] | None = None  # the base's means and its pixel size
+        self.count: int | None = None  # of the views that show enough of the splats; None as long as it is not known
+        self.size = 1.0  # fraction of their size at which views are weighed: less where a time budget leaves no time for large ones
+        self.shown = torch.empty(0, dtype=torch.bool)  # which splats views show (`may_show`)
+        self.notes: list[str] = []  # on what they show
+
+    def measured(self, base: SplatModel) -> Tensor:
+        """[N]: the blend weights of the base's splats, in target pixels of a view, from as many views as show enough of them."""
+        problem, gaussians = self._problem, base.gaussians(self._problem.views[0]).detach()
+
+        def over(numbers: Sequence[int], size: float) -> tuple[Tensor, float]:
+            return weighed(gaussians, [problem.views[number] for number in numbers], problem.backend, problem.base_effects, size)
+
+        all_views = range(len(problem.views))
+        first = evenly(all_views, LEAST_VIEWS)
+        self.size = self._clock.size(problem.views[0], LEAST_VIEWS, lambda size: over([0], size))
+        with self._clock.timing("weights"):
+            weights, shown = over(first, self.size)
+        self.count = views_for(shown)
+        while self.count > LEAST_VIEWS and not self._clock.allows("weights", self.count / LEAST_VIEWS - 1):
+            self.count //= 2
+        if further := [number for number in evenly(all_views, self.count) if number not in first]:
+            part = len(further) / (len(first) + len(further))
+            with self._clock.timing("weights", part):
+                weights = weights.lerp(over(further, self.size)[0], part)
+        weights = weights * problem.scale**2
+        whole, looked_at = self.whole(gaussians, self.pixel_size(gaussians.means)), evenly(problem.views, self.count)
+        self.shown = may_show(weights, whole, gaussians.means, problem.views, looked_at)
+        drawn = gaussians.opacities >= MIN_ALPHA
+        if (hidden := float((~self.shown)[drawn].float().mean())) > HIDDEN:
+            advice = "give cameras that show all of the scene, or look at it from where these do"
+            self.notes.append(f"no view shows {hidden:.0%} of the splats, of which the dB say nothing: {advice}")
+        return weights
+
+    def whole(self, gaussians: Gaussians, pixel: Tensor) -> Tensor:
+        """`whole_weights` of splats [N] where a base pixel has these sizes [N], in world units."""
+        problem = self._problem
+        return whole_weights(gaussians, pixel, problem.views, problem.base_effects, problem.scale)
+
+    def pixel_size(self, means: Tensor) -> Tensor:
+        """`pixel_size` at means [N, 3]; that of the base, which is asked for first, serves all candidates."""
+        if self._of_base is not None and torch.equal(self._of_base[0], means):
+            return self._of_base[1]
+        pixels = pixel_size(means, self._problem.closest_of, self.count)
+        self._of_base = self._of_base or (means, pixels)
+        return pixels
