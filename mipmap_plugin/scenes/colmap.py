@@ -12,7 +12,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError, brief
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import pixels
-from mipmap_plugin.scenes.base import ABSENT, Scene, refuse_other_shape
+from mipmap_plugin.scenes.base import ABSENT, SPLIT, Scene, refuse_other_shape
 from mipmap_plugin.scenes.cameras_json import TEST_EVERY, photographs_folder, trained_size
 from mipmap_plugin.scenes.colmap_sizes import refuse_truncated
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, note
@@ -143,7 +143,7 @@ def _points(model: pycolmap.Reconstruction) -> Tensor | None:
 
 
 def _notes(cameras: list[Camera], photographs: dict[Camera, Path], folder: Path, cfg: dict[str, Any]) -> list[str]:
-    notes = [f"{len(cameras)} cameras in the order of their names: every {TEST_EVERY}th is for testing, the others for training"]
+    notes = [f"{len(cameras)} cameras in the order of their names: every {TEST_EVERY}th {SPLIT}, the others for training"]
     if absent := len(cameras) - len(photographs):
         notes.append(f"{absent} of {len(cameras)} photographs of the COLMAP model are {ABSENT} from {folder}; their cameras are views without one")
     if cfg and not cfg.get("eval"):

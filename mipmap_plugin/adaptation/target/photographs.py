@@ -17,6 +17,7 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models.base import Placed, SplatModel
 from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.scenes import Scene
+from mipmap_plugin.scenes.base import SPLIT
 
 
 class Photographs:
@@ -84,9 +85,13 @@ def _difference(one: Camera, other: Camera) -> float:
 
 
 def placed(model: SplatModel, scene: Scene) -> Scene:
-    """The scene in the frame that the model was trained in: gsplat and splatfacto transform it. Raises SceneError."""
+    """The scene in the frame that the model was trained in, and with its test views: gsplat and splatfacto transform it. Raises SceneError."""
     if not model.traits.placed:
         return scene
     scene = scene.original()
     capture = Capture(scene.points, scene.smaller if scene.images else None, scene.applied_scale)
-    return scene.with_cameras(cast(Placed, model).as_trained(scene.cameras, capture))
+    there = scene.with_cameras(cast(Placed, model).as_trained(scene.cameras, capture))
+    if [camera.split for camera in there.cameras] == [camera.split for camera in scene.cameras]:
+        return there
+    tests = f"the checkpoint's options hold out {len(there.split('test'))} of {len(there.cameras)} views: these are for testing"
+    return replace(there, notes=[*(note for note in there.notes if SPLIT not in note), tests])
