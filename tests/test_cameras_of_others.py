@@ -61,6 +61,15 @@ def test_3dgs_trains_on_blender_scenes_at_the_size_of_r_and_centered(tmp_path, c
     assert load_scene(tmp_path).cameras[0].cx == 19.0
 
 
+def test_4dgaussians_divides_times_by_the_last(tmp_path):
+    """scene/dataset_readers.py, read_timeline: of training and test frames together. Deformable 3D Gaussians takes them as they are."""
+    for split, time in (("train", 3), ("test", 12)):
+        frame = {"file_path": split, "transform_matrix": POSE, "time": time}
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps({"w": 8, "h": 8, "fl_x": 9, "frames": [frame]}))
+    assert [camera.time for camera in load_scene(tmp_path, {"kplanes_config": {}}).cameras] == [0.25, 1.0]
+    assert [camera.time for camera in load_scene(tmp_path, {"is_6dof": False}).cameras] == [3.0, 12.0]
+
+
 def test_a_view_has_the_same_name_with_its_photograph_and_without(tmp_path):
     path = transforms(tmp_path)
     names = [camera.name for camera in read_transforms(path).cameras]

@@ -51,12 +51,14 @@ def read_transforms(path: str | Path, cfg: dict[str, Any] | None = None) -> Scen
     files = transforms_files(path)
     for file, split in files:
         found, absent = _read_file(file, split)
-        views += [(_as_trained(camera, cfg or {}), image, lens) for camera, image, lens in found]
+        views += found
         if absent:
             unsized = absent - sum(image is None for _, image, _ in found)
             notes.append(f"{file.name}: {_counted(absent)} {ABSENT}{_left_out(unsized)}")
     if not views:
         raise SceneError(f"{path}: none of the listed images is there, and the sizes are unknown; add the images, or w and h to the file")
+    if cfg:
+        views = _as_trained(views, cfg)
     cameras, distorted = tuple(camera for camera, _, _ in views), [lens for _, _, lens in views if lens]
     images = {camera: image for camera, image, _ in views if image}
     lenses = {image: lens for _, image, lens in views if image and lens}
@@ -90,15 +92,19 @@ def _first_file(folder: Path, *names: str) -> list[Path]:
     return [folder / name for name in names if (folder / name).is_file()][:1]
 
 
-def _as_trained(camera: Camera, cfg: dict[str, Any]) -> Camera:
-    """The camera as projects with cfg_args take it: at its training size, with the principal point in the middle.
+def _as_trained(views: list[View], cfg: dict[str, Any]) -> list[View]:
+    """The views as projects with cfg_args take them: at their training size, with the principal point in the middle.
 
-    4DGaussians, which has the option `kplanes_config`, takes no notice of `resolution`.
+    4DGaussians, which has the option `kplanes_config`, takes no notice of `resolution`, and divides all times by the last one.
     """
-    if not cfg:
-        return camera
-    size = trained_size(camera.width, camera.height, {"resolution": 1 if "kplanes_config" in cfg else cfg.get("resolution", 1)})
-    return replace(camera.resized(*size), cx=size[0] / 2, cy=size[1] / 2)
+    is_4dgs = "kplanes_config" in cfg
+    last = (max((camera.time or 0.0 for camera, _, _ in views)) if is_4dgs else 0.0) or 1.0
+    trained = []
+    for camera, image, lens in views:
+        size = trained_size(camera.width, camera.height, {"resolution": 1 if is_4dgs else cfg.get("resolution", 1)})
+        time = None if camera.time is None else camera.time / last
+        trained.append((replace(camera.resized(*size), cx=size[0] / 2, cy=size[1] / 2, time=time), image, lens))
+    return trained
 
 
 def _counted(absent: int) -> str:
