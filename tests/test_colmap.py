@@ -163,6 +163,20 @@ def test_broken_models_are_refused_in_one_sentence(tmp_path):
         load_scene(tmp_path / "torn")
 
 
+def test_what_is_no_perspective_camera_or_has_no_name_is_refused_in_one_sentence(tmp_path):
+    """COLMAP 4 has panoramas, whose model has no focal length."""
+    write_text_model(tmp_path / "round/sparse/0", ["a.png"], "EQUIRECTANGULAR", "64 48")
+    with pytest.raises(SceneError, match=r"a\.png: has a lens that is not perspective \(EQUIRECTANGULAR\)"):
+        load_scene(tmp_path / "round")
+    write_text_model(tmp_path / "text", ["a.png"])
+    model = pycolmap.Reconstruction(tmp_path / "text")
+    model.images[1].name = ""
+    (tmp_path / "nameless/sparse/0").mkdir(parents=True)
+    model.write_binary(tmp_path / "nameless/sparse/0")
+    with pytest.raises(SceneError, match="image 1 of the COLMAP model has no name"):
+        load_scene(tmp_path / "nameless")
+
+
 def test_quaternions_may_have_any_norm(tmp_path):
     def poses(factor):
         file = tmp_path / str(factor) / "sparse/0/images.txt"

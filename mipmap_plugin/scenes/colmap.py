@@ -49,6 +49,8 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         raise SceneError(f"{path}: the COLMAP model has names of images that are no UTF-8; copy or export it again") from error
     if not images:
         raise SceneError(f"{path}: the COLMAP model has no image with a pose; run the mapper again")
+    if nameless := [image.image_id for image in images if not Path(image.name).name]:
+        raise SceneError(f"{path}: image {nameless[0]} of the COLMAP model has no name; copy or export it again")
     cameras: list[Camera] = []
     photographs: dict[Camera, Path] = {}
     lenses: dict[Path, Lens] = {}
@@ -127,6 +129,8 @@ def _lens(camera: pycolmap.Camera) -> Lens | None:
 def _camera(model: pycolmap.Reconstruction, image: pycolmap.Image, split: Literal["train", "test"], *, centered: bool) -> Camera:
     """The camera at COLMAP's size. `centered`: the principal point is moved to the center."""
     lens = model.cameras[image.camera_id]
+    if not lens.focal_length_idxs():
+        raise SceneError(f"{image.name}: has a lens that is not perspective ({lens.model.name}); resample its images to a pinhole first")
     viewmat = torch.eye(4, dtype=torch.float64)
     pose = image.cam_from_world()
     pose.rotation.normalize()  # as COLMAP does when it reads a text file, and pycolmap does not
