@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -13,7 +15,7 @@ from mipmap_plugin.errors import SceneError, brief
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import pixels
 from mipmap_plugin.scenes.base import ABSENT, SPLIT, Scene, refuse_other_shape
-from mipmap_plugin.scenes.cameras_json import TEST_EVERY, photographs_folder, trained_size
+from mipmap_plugin.scenes.cameras_json import TEST_EVERY, numbers_views, photographs_folder, trained_size
 from mipmap_plugin.scenes.colmap_sizes import refuse_truncated
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, note
 
@@ -54,6 +56,7 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     cameras: list[Camera] = []
     photographs: dict[Camera, Path] = {}
     lenses: dict[Path, Lens] = {}
+    trained = count()
     for index, image in enumerate(images):
         camera = _camera(model, image, "train" if index % TEST_EVERY else "test", centered=bool(cfg))
         photograph, lens = folder / image.name, _lens(model.cameras[image.camera_id])
@@ -65,6 +68,8 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         if lens is not None:
             camera, lenses[photograph] = lens.straightened(camera), lens
         camera = camera.resized(*trained_size(camera.width, camera.height, options))
+        if numbers_views(cfg, camera.split):
+            camera = replace(camera, index=next(trained))
         cameras.append(camera)
         if exists:
             photographs[camera] = photograph

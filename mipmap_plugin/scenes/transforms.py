@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import count
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
@@ -16,7 +17,7 @@ from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import ROTATION_TOLERANCE, numbers, pixels, positive, present, read_json, rotation
 from mipmap_plugin.scenes.base import ABSENT, Scene, refuse_other_shape
-from mipmap_plugin.scenes.cameras_json import trained_size
+from mipmap_plugin.scenes.cameras_json import numbers_views, trained_size
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, can_undistort, note
 
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
@@ -99,11 +100,12 @@ def _as_trained(views: list[View], cfg: dict[str, Any]) -> list[View]:
     """
     is_4dgs = "kplanes_config" in cfg
     last = (max((camera.time or 0.0 for camera, _, _ in views)) if is_4dgs else 0.0) or 1.0
-    trained = []
+    trained, numbers = list[View](), count()
     for camera, image, lens in views:
         size = trained_size(camera.width, camera.height, {"resolution": 1 if is_4dgs else cfg.get("resolution", 1)})
         time = None if camera.time is None else camera.time / last
-        trained.append((replace(camera.resized(*size), cx=size[0] / 2, cy=size[1] / 2, time=time), image, lens))
+        index = next(numbers) if numbers_views(cfg, camera.split) else None
+        trained.append((replace(camera.resized(*size), cx=size[0] / 2, cy=size[1] / 2, time=time, index=index), image, lens))
     return trained
 
 
