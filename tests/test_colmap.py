@@ -103,6 +103,9 @@ def test_a_checkpoint_with_cfg_args_has_its_principal_point_in_the_middle(tmp_pa
     write_text_model(tmp_path / "sparse/0", names(1))
     camera = load_scene(tmp_path, {"resolution": 2, "eval": True}).cameras[0]
     assert (camera.cx, camera.cy) == (16, 12)
+    write_text_model(tmp_path / "bent/sparse/0", names(1), "SIMPLE_RADIAL", "70 20 24 0.1")  # it was trained on the undistorted one
+    camera = load_scene(tmp_path / "bent", {"eval": True}).cameras[0]
+    assert (camera.cx, camera.cy) == (camera.width / 2, camera.height / 2)
 
 
 @pytest.mark.parametrize(

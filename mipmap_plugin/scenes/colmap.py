@@ -67,6 +67,7 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
             camera, lens = camera.resized(*size), lens and lens.at(size)
         if lens is not None:
             camera, lenses[photograph] = lens.straightened(camera), lens
+            camera = replace(camera, cx=camera.width / 2, cy=camera.height / 2) if cfg else camera
         camera = camera.resized(*trained_size(camera.width, camera.height, options))
         if numbers_views(cfg, camera.split):
             camera = replace(camera, index=next(trained))
