@@ -125,6 +125,9 @@ def test_nerfstudio_holds_out_the_views_that_its_config_says(tmp_path, options, 
     config.write_text(config.read_text() + options + "\n")
     held_out = [camera.name for camera in placed(load_model(tmp_path / "r"), Scene(cameras, {}, tmp_path)).split("test")]
     assert sorted(held_out) == [names[number] for number in tests]
+    eighths = tuple(replace(camera, split="test" if number % 8 == 0 else "train") for number, camera in enumerate(cameras[::-1]))
+    colmap = placed(load_model(tmp_path / "r"), Scene(eighths, {}, tmp_path, points=torch.zeros(1, 3))).split("test")
+    assert [camera.name for camera in colmap] == [names[number] for number in ([0, 8] if options == "" or "interval" in options else tests)]
     listed = Scene((replace(cameras[0], split="test"), *cameras[1:]), {}, tmp_path)  # by the file of the scene, which wins
     assert [camera.name for camera in placed(load_model(tmp_path / "r"), listed).split("test")] == [cameras[0].name]
 

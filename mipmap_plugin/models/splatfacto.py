@@ -82,10 +82,12 @@ class SplatfactoHost:
     def as_trained(self, cameras: Sequence[Camera], capture: Capture, means: Tensor) -> list[Camera]:
         """Transform the cameras by dataparser_transforms.json, and shrink large images as nerfstudio does. Raises SceneError.
 
-        Of a transforms.json that lists no test views, those of the training are for testing.
+        Those views are for testing that the config holds out, unless the scene says it: a transforms.json by its lists, and COLMAP's every eighth are
+        those of nerfstudio's own reader of COLMAP.
         """
-        names = [camera.name for camera in cameras]
-        if capture.points is None and len(set(names)) == len(names) and all(camera.split == "train" for camera in cameras):
+        names, mode = [camera.name for camera in cameras], self.options.get("eval_mode")
+        said = any(camera.split == "test" for camera in cameras) if capture.points is None else mode in (None, "interval")
+        if not said and len(set(names)) == len(names):
             cameras = held_out(cameras, _tests(names, self.options))
         frame = self._frame()
         frame[:3] /= capture.applied_scale  # contained in the file's scale, but already applied to the poses
