@@ -7,7 +7,7 @@ import pytest
 import tiny
 
 from mipmap_plugin.errors import SceneError
-from mipmap_plugin.scenes import read_cameras, read_transforms, write_cameras
+from mipmap_plugin.scenes import load_scene, read_cameras, read_transforms, write_cameras
 
 POSE = [[1, 0, 0, 1.0], [0, 1, 0, 2.0], [0, 0, 1, 3.0], [0, 0, 0, 1]]
 
@@ -41,6 +41,33 @@ def test_a_transforms_file_may_list_the_frames_of_each_split(tmp_path):
     lists = {"train_filenames": ["images/a.JPG", "images/c.JPG"], "val_filenames": ["images/b.1.JPG"], "test_filenames": ["images/b.1.JPG"]}
     assert [camera.split for camera in read_transforms(transforms(tmp_path, **lists)).cameras] == ["train", "test", "train"]
     assert [camera.split for camera in read_transforms(transforms(tmp_path)).cameras] == ["train"] * 3
+
+
+def test_names_in_the_lists_of_a_transforms_file_may_be_written_otherwise(tmp_path):
+    """nerfstudio compares paths, for which `./a` is `a`; before, all views were for testing."""
+    lists = {"train_filenames": ["./images/a.JPG", "images\\c.JPG"]}
+    assert [camera.split for camera in read_transforms(transforms(tmp_path, **lists)).cameras] == ["train", "test", "train"]
+
+
+@pytest.mark.parametrize(
+    ("cfg", "size"),
+    [({"resolution": 2}, (15, 20)), ({"resolution": 10, "images": "images_4"}, (7, 10)), ({"resolution": 2, "kplanes_config": {}}, (30, 40))],
+)
+def test_3dgs_trains_on_blender_scenes_at_the_size_of_r_and_centered(tmp_path, cfg, size):
+    """utils/camera_utils.py, loadCam: -r counts for all scenes. 4DGaussians has the option, and does not use it."""
+    transforms(tmp_path, cx=19.0).rename(tmp_path / "transforms_train.json")
+    [camera, *_] = load_scene(tmp_path, cfg).cameras
+    assert (camera.size, camera.cx, camera.fx) == (size, size[1] / 2, 50 * size[1] / 40)
+    assert load_scene(tmp_path).cameras[0].cx == 19.0
+
+
+def test_4dgaussians_divides_times_by_the_last(tmp_path):
+    """scene/dataset_readers.py, read_timeline: of training and test frames together. Deformable 3D Gaussians takes them as they are."""
+    for split, time in (("train", 3), ("test", 12)):
+        frame = {"file_path": split, "transform_matrix": POSE, "time": time}
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps({"w": 8, "h": 8, "fl_x": 9, "frames": [frame]}))
+    assert [camera.time for camera in load_scene(tmp_path, {"kplanes_config": {}}).cameras] == [0.25, 1.0]
+    assert [camera.time for camera in load_scene(tmp_path, {"is_6dof": False}).cameras] == [3.0, 12.0]
 
 
 def test_a_view_has_the_same_name_with_its_photograph_and_without(tmp_path):

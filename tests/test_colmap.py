@@ -1,5 +1,6 @@
 """COLMAP scenes: the mip-NeRF 360 protocol, absent photographs, distortion, and a real phone capture."""
 
+import json
 import math
 import sys
 
@@ -102,6 +103,26 @@ def test_a_checkpoint_with_cfg_args_has_its_principal_point_in_the_middle(tmp_pa
     write_text_model(tmp_path / "sparse/0", names(1))
     camera = load_scene(tmp_path, {"resolution": 2, "eval": True}).cameras[0]
     assert (camera.cx, camera.cy) == (16, 12)
+    write_text_model(tmp_path / "bent/sparse/0", names(1), "SIMPLE_RADIAL", "70 20 24 0.1")  # it was trained on the undistorted one
+    camera = load_scene(tmp_path / "bent", {"eval": True}).cameras[0]
+    assert (camera.cx, camera.cy) == (camera.width / 2, camera.height / 2)
+
+
+@pytest.mark.parametrize(
+    ("cfg", "numbers"),
+    [({"eval": True}, [None, *range(7), None, 7]), ({"eval": False}, list(range(10))), ({"eval": True, "lod": 3}, [None] * 10),
+     ({"eval": True, "appearance_dim": 0}, [None] * 10)],
+)  # fmt: skip
+def test_training_views_are_numbered_for_models_with_appearances(tmp_path, cfg, numbers):
+    """By their names, as in Scaffold-GS and Octree-GS: each has an appearance of its own, without which it is shown with the mean of all."""
+    write_text_model(tmp_path / "sparse/0", [f"{number}.png" for number in range(10)])
+    assert [camera.index for camera in load_scene(tmp_path, {"appearance_dim": 32, **cfg}).cameras] == numbers
+    frames = [{"file_path": name, "transform_matrix": np.eye(4).tolist()} for name in "ab"]
+    for split in ("train", "test"):
+        (tmp_path / f"blender/transforms_{split}.json").parent.mkdir(exist_ok=True)
+        (tmp_path / f"blender/transforms_{split}.json").write_text(json.dumps({"w": 8, "h": 8, "fl_x": 9, "frames": frames}))
+    blender = load_scene(tmp_path / "blender", {"appearance_dim": 32, **cfg})
+    assert [camera.index for camera in blender.cameras] == ([*numbers[1:3], None, None] if cfg["eval"] else [0, 1, 2, 3])
 
 
 def test_notes_say_what_was_assumed(tmp_path):
@@ -161,6 +182,20 @@ def test_broken_models_are_refused_in_one_sentence(tmp_path):
         (tmp_path / f"torn/sparse/0/{name}.bin").write_bytes(b"\1\2\3")
     with pytest.raises(SceneError, match="is truncated or damaged, for it is shorter than its own counts say"):
         load_scene(tmp_path / "torn")
+
+
+def test_what_is_no_perspective_camera_or_has_no_name_is_refused_in_one_sentence(tmp_path):
+    """COLMAP 4 has panoramas, whose model has no focal length."""
+    write_text_model(tmp_path / "round/sparse/0", ["a.png"], "EQUIRECTANGULAR", "64 48")
+    with pytest.raises(SceneError, match=r"a\.png: has a lens that is not perspective \(EQUIRECTANGULAR\)"):
+        load_scene(tmp_path / "round")
+    write_text_model(tmp_path / "text", ["a.png"])
+    model = pycolmap.Reconstruction(tmp_path / "text")
+    model.images[1].name = ""
+    (tmp_path / "nameless/sparse/0").mkdir(parents=True)
+    model.write_binary(tmp_path / "nameless/sparse/0")
+    with pytest.raises(SceneError, match="image 1 of the COLMAP model has no name"):
+        load_scene(tmp_path / "nameless")
 
 
 def test_quaternions_may_have_any_norm(tmp_path):

@@ -22,8 +22,9 @@ from ply_files import write, write_splats
 
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError, OutputError, SettingsError
-from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.formats.ply import read_ply, write_ply
 from mipmap_plugin.formats.splat_transform import refuse_exchange, refuse_unread
+from mipmap_plugin.formats.tags import mark_antialiased
 from mipmap_plugin.levels.tiles import write_tile
 from mipmap_plugin.models import detect, load_model
 from mipmap_plugin.models.adapted_name import adapted_name
@@ -426,6 +427,55 @@ def test_real_splats_survive_each_format(shared_data, tmp_path, ending):
         pytest.skip(str(error))
     saved = base.save(path, provenance={})
     assert (agree(base, load_model(saved), nearest=True) > 0.95).all()
+
+
+@pytest.fixture
+def old_tool(tool):
+    """A version of before 3.0, which loses what a file says of how it is to be drawn."""
+    write_ply(tool / "answer.ply", read_ply(tool / "answer.ply").columns, overwrite=True)
+    forget = 'pathlib.Path(target).write_bytes(b"".join(line for line in pathlib.Path(source).open("rb") if b"comment" not in line))'
+    with (tool / "splat-transform").open("a") as script:
+        script.write(f"if not target.endswith('plain.ply'):\n    {forget}\n")
+    return tool
+
+
+def as_sog(path, model):
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a/meta.json", json.dumps({"version": 2, "model": model, "means": {"files": ["means_l.webp"]}}))
+        archive.writestr("a/means_l.webp", b"abcd")
+    return path
+
+
+@pytest.mark.parametrize("flag", [0, 1, 2, 3])
+@pytest.mark.parametrize("packed", [gzip.compress, bytes])
+def test_an_spz_of_antialiased_splats_is_drawn_so_whatever_version_of_the_tool_reads_it(tmp_path, old_tool, flag, packed):
+    spz = bytearray(SPZ)
+    spz[14] = flag
+    (tmp_path / "a.spz").write_bytes(packed(bytes(spz)))
+    assert load_model(tmp_path / "a.spz").trained.screen_filter == ("antialiased" if flag & 1 else "classic")
+
+
+@pytest.mark.parametrize(("model", "screen_filter"), [("antialiased", "antialiased"), (None, "classic"), (["antialiased"], "classic")])
+def test_a_sog_is_drawn_as_its_meta_says_whatever_version_of_the_tool_reads_it(tmp_path, old_tool, model, screen_filter):
+    assert load_model(as_sog(tmp_path / "a.sog", model)).trained.screen_filter == screen_filter
+
+
+def test_a_sog_of_flat_splats_is_not_taken_for_one_of_others(tmp_path, old_tool):
+    assert "its splats are of 2D Gaussian splatting, not read from this format" in sentence(as_sog(tmp_path / "a.sog", "2dgs"))
+
+
+def test_a_compressed_ply_is_drawn_as_its_header_says_whatever_version_of_the_tool_reads_it(tmp_path, old_tool):
+    write(tmp_path / "a.ply", {"packed_position": np.zeros(1, np.int32)}, comments=["SplatRenderMode: mip"])
+    assert load_model(tmp_path / "a.ply").trained.screen_filter == "antialiased"
+
+
+def test_antialiased_splats_are_marked_where_the_tool_does_not(tmp_path, old_tool):
+    (tmp_path / "a.spz").write_bytes(gzip.compress(SPZ))
+    mark_antialiased(tmp_path / "a.spz")
+    assert load_model(tmp_path / "a.spz").trained.screen_filter == "antialiased"
+    for screen_filter, told in (("antialiased", ["SplatRenderMode: mip"]), ("classic", [])):
+        model = tiny.model(trained=TrainedScale(screen_filter=screen_filter))
+        assert read_ply(model.save(tmp_path / f"{screen_filter}.compressed.ply", provenance={})).comments == tuple(told)
 
 
 @pytest.mark.parametrize("inside", [True, False])

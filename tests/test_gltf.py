@@ -13,7 +13,8 @@ import torch
 from gltf_files import EXTENSION
 
 from mipmap_plugin.cli import main
-from mipmap_plugin.errors import CheckpointError, OutputExists, SettingsError
+from mipmap_plugin.errors import CheckpointError, OutputError, OutputExists, SettingsError
+from mipmap_plugin.formats import glb
 from mipmap_plugin.formats.gltf import read_gltf
 from mipmap_plugin.formats.splat_transform import refuse_unread
 from mipmap_plugin.models import detect, load_model
@@ -212,6 +213,14 @@ def test_what_is_written_is_read_again(tmp_path, degree):
 def test_high_bands_and_columns_have_no_place(tmp_path):
     with pytest.warns(UserWarning, match="SH bands above degree 3 are dropped, which glTF has no place for"):
         assert load_model(tiny.model(degree=4).save(tmp_path / "a.glb", provenance={})).sh_degree == 3
+
+
+def test_more_than_a_glb_holds_is_refused_in_a_sentence(tmp_path, monkeypatch):
+    """Its length has 32 bits."""
+    monkeypatch.setattr(glb, "MOST_BYTES", 1000)
+    with pytest.raises(OutputError, match=r"a\.glb: a \.glb holds at most 4 GiB, and these 60 splats take .*; give a \.ply"):
+        tiny.model().save(tmp_path / "a.glb", provenance={})
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(("viewer", "ending"), [(None, "_x0.25.glb"), ("three", "_x0.25_three.glb"), ("spark", "_x0.25_spark.ply")])

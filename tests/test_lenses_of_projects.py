@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from torch_checkpoints import gsplat_folder, splatfacto_folder, splats
 from mipmap_plugin.adaptation.target.photographs import placed
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.hosts import Capture
-from mipmap_plugin.scenes import load_scene, read_cameras, write_cameras
+from mipmap_plugin.scenes import Scene, load_scene, read_cameras, write_cameras
 
 EYE = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
 
@@ -95,6 +96,40 @@ def test_a_scale_that_was_applied_before_is_not_applied_again(tmp_path):
     scene = transforms(tmp_path / "scene", width=64, height=48, applied_scale=0.1, frames=[frame])
     [camera] = placed(of_nerfstudio(tmp_path / "r", scale=0.5 * 0.1), scene).cameras
     torch.testing.assert_close(camera.center, torch.tensor([1.5, 0.0, 0.0], dtype=torch.float64))
+
+
+def test_gsplat_holds_out_the_views_that_its_options_say(tmp_path):
+    """Not every eighth where test_every is another number: a view that was trained on is no test view."""
+    cameras = tuple(replace(view, name=f"{i:02d}", split="train" if i % 8 else "test") for i, view in enumerate(tiny.cameras(10)))
+    scene = Scene(cameras, {}, tmp_path, ["10 cameras in the order of their names: every 8th is for testing, the others for training", "other"])
+    model = of_gsplat(tmp_path / "r", 1)
+    assert placed(model, scene).notes == scene.notes
+    cfg = tmp_path / "r/cfg.yml"
+    cfg.write_text(cfg.read_text() + "test_every: 1000\n")
+    here = placed(load_model(tmp_path / "r"), scene)
+    assert [camera.name for camera in here.split("test")] == ["00"]
+    assert here.notes == ["other", "the checkpoint's options hold out 1 of 10 views: these are for testing"]
+
+
+@pytest.mark.parametrize(
+    ("options", "tests"),
+    [("eval_mode: fraction\ntrain_split_fraction: 0.75", [4, 9]), ("eval_mode: interval\neval_interval: 4", [0, 4, 8]),
+     ("eval_mode: filename", [3, 9]), ("eval_mode: all", []), ("", [])],
+)  # fmt: skip
+def test_nerfstudio_holds_out_the_views_that_its_config_says(tmp_path, options, tests):
+    """data/utils/dataparsers_utils.py, in the order of names, whatever that of the frames is."""
+    names = [f"{number:02d}_{'eval' if number in (3, 9) else 'train'}" for number in range(11)]
+    cameras = tuple(replace(view, name=name) for name, view in zip(names, tiny.cameras(11), strict=True))[::-1]
+    of_nerfstudio(tmp_path / "r")
+    config = tmp_path / "r/config.yml"
+    config.write_text(config.read_text() + options + "\n")
+    held_out = [camera.name for camera in placed(load_model(tmp_path / "r"), Scene(cameras, {}, tmp_path)).split("test")]
+    assert sorted(held_out) == [names[number] for number in tests]
+    eighths = tuple(replace(camera, split="test" if number % 8 == 0 else "train") for number, camera in enumerate(cameras[::-1]))
+    colmap = placed(load_model(tmp_path / "r"), Scene(eighths, {}, tmp_path, points=torch.zeros(1, 3))).split("test")
+    assert [camera.name for camera in colmap] == [names[number] for number in ([0, 8] if options == "" or "interval" in options else tests)]
+    listed = Scene((replace(cameras[0], split="test"), *cameras[1:]), {}, tmp_path)  # by the file of the scene, which wins
+    assert [camera.name for camera in placed(load_model(tmp_path / "r"), listed).split("test")] == [cameras[0].name]
 
 
 @pytest.mark.parametrize(("options", "width"), [({"ds": 8, "fork": 2, "resolution": -1}, 618), ({"ds": 1, "fork": 2}, 4946), ({"ds": 8}, 4946)])

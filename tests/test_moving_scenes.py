@@ -100,6 +100,30 @@ def test_hypernerf_without_test_views_trains_on_every_fourth(tmp_path):
     assert [int(camera.name) for camera in scene.split("test")] == [2, 6]
 
 
+@pytest.mark.parametrize(
+    ("above", "shrunk", "train", "test"),
+    [("vrig-chicken", 4, [0, 2, 4, 6, 8], [1, 3, 5, 7]), ("NeRF-DS", 1, [0, 2, 4, 6, 8], [1, 3, 5, 7]),
+     ("interp_aleks", 2, [0, 4, 8], [2, 6]), ("misc", 2, [0, 4, 8], [])],
+)  # fmt: skip
+def test_deformable_3dgs_moves_and_scales_hypernerf_captures(tmp_path, above, shrunk, train, test):
+    """scene/dataset_readers.py, readNerfiesCameras: another frame, time, size and split than those of 4DGaussians."""
+    path, center, scale = hypernerf(tmp_path / above / "s", rgb=False), np.array([0.5, -1.0, 2.0]), 0.25
+    with pytest.raises(SceneError, match="time_id"):
+        load_scene(path, {"is_6dof": False})
+    (path / "metadata.json").write_text(json.dumps({f"{i:06d}": {"warp_id": i, "time_id": 3 * i} for i in range(9)}))
+    (path / "scene.json").write_text(json.dumps({"scale": scale, "center": center.tolist(), "near": 0.1, "far": 2.0}))
+    cfg = {"is_6dof": False, "is_blender": False, "eval": True, "resolution": -1}
+    scene = load_scene(path, cfg)
+    assert [[int(camera.name) for camera in scene.split(split)] for split in ("train", "test")] == [train, test]
+    for camera in scene.cameras:
+        pose = poses(9)[int(camera.name)]
+        turn = (pose[:, :3] @ np.diag([1.0, -1, -1])).T
+        wanted = -scale * turn @ (pose[:, 3] - center)
+        assert np.allclose(camera.viewmat[:3, :3].numpy(), turn) and np.allclose(camera.viewmat[:3, 3].numpy(), wanted)
+        assert (camera.width, camera.fx, camera.time) == (536 // shrunk, 500.0 / shrunk, int(camera.name) / 8)
+    assert {camera.split for camera in load_scene(path, {**cfg, "eval": False}).cameras} == {"train"}
+
+
 def test_broken_ones_are_refused_in_one_sentence(tmp_path):
     path = dynerf(tmp_path / "d")
     (path / "cam03.mp4").unlink()

@@ -53,6 +53,22 @@ def test_images_of_several_sizes_are_brought_to_the_density_of_their_own_views()
     assert [camera.width for camera in at_density_of(photographs, by_name)] == [400, 1600, 1600]
 
 
+def test_the_principal_point_is_where_the_base_has_it():
+    """3DGS takes it to be in the middle, whatever COLMAP found: a base that was trained so would be compared with a shifted picture."""
+    found = Camera(4000, 3000, 3000, 3000, 1900, 1550, torch.eye(4), name="images/a.jpg")
+    off_center = replace(found.resized(1000, 750), name="a")
+    centered = replace(off_center, cx=500, cy=375)
+    assert [(camera.cx, camera.cy) for base in (centered, off_center) for camera in at_density_of([found], [base])] == [(500, 375), (475, 387.5)]
+
+
+def test_a_photograph_of_training_keeps_its_own_appearance():
+    """Scaffold-GS has an embedding for each training view; without its number a view is shown with the mean of all."""
+    base = [replace(view, name=name, index=number) for number, (name, view) in enumerate(zip("ab", tiny.cameras(2), strict=True))]
+    photographs = [replace(view, name=f"images/{name}.png") for name, view in zip("bac", tiny.cameras(3), strict=True)]
+    assert [camera.index for camera in at_density_of(photographs, base)] == [1, 0, None]
+    assert at_density_of([replace(photographs[0], split="test")], base)[0].index is None  # another view of the same name, as in Blender's scenes
+
+
 def test_the_truth_is_the_image_where_there_is_one_and_the_bases_elsewhere(scene):
     real, other = Photographs(scene, tiny.cameras(), BLACK), tiny.cameras(1)[0]
     truth = PseudoTruth(BaseImages(tiny.model(), ReferenceBackend(), Effects(1)), 2, recipe("default", 2), real)

@@ -12,11 +12,15 @@ from typing import Any
 
 import numpy as np
 
+from mipmap_plugin.errors import OutputError
 from mipmap_plugin.formats.atomic import new_file
 from mipmap_plugin.formats.gltf import BINARY_CHUNK, DISPLAY, JSON_CHUNK, MAGIC, SPLATTING
 
 # glTF's code of float32, and what its vectors are called by their lengths.
 FLOAT, VECTORS = 5126, {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+
+# Bytes of the splats in one file, whose length has 32 bits: 18 million of SH degree 3.
+MOST_BYTES = 2**32 - 2**16
 
 
 def write_glb(path: Path, columns: Mapping[str, np.ndarray], *, overwrite: bool = False) -> Path:
@@ -38,8 +42,11 @@ def write_glb(path: Path, columns: Mapping[str, np.ndarray], *, overwrite: bool 
         named[f"{SPLATTING}:SH_DEGREE_{degree}_COEF_{degree + order}"] = _stacked(
             [sign * columns[f"f_rest_{channel * bands + number - 1}"] for channel in range(3)]
         )
+    size = sum(array.nbytes for array in named.values())
+    if size > MOST_BYTES:
+        raise OutputError(f"{path}: a .glb holds at most 4 GiB, and these {len(named['POSITION']):,} splats take {size / 2**30:.1f}; give a .ply")
     with new_file(path, overwrite) as temporary, temporary.open("wb") as file:
-        file.write(before_binary(_document(named), sum(array.nbytes for array in named.values())))
+        file.write(before_binary(_document(named), size))
         for array in named.values():
             file.write(array.tobytes())
     return path

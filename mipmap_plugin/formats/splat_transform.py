@@ -20,6 +20,7 @@ from typing import Any
 
 from mipmap_plugin.errors import TEMPORARY, CheckpointError, OutputError, SettingsError
 from mipmap_plugin.formats.atomic import new_file
+from mipmap_plugin.formats.tags import mark_antialiased, mode_in_exchange, render_mode
 
 # `magic.kind_of` -> name of the format, and the suffix by which splat-transform recognizes it.
 EXCHANGE = {
@@ -168,6 +169,7 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
         if reason := _run(tool, [source], plain):
             raise CheckpointError(f"{path} is {name}, but {TOOL} does not read it ({reason}); export it again")
         _settle_frame(tool, source, plain)
+        _settle_mode(_mode(source, kind), plain)
         yield plain
 
 
@@ -196,6 +198,9 @@ def write_exchange(path: Path, write: Callable[[Path], Any], *, overwrite: bool)
         _settle_frame(tool, converted, plain)
         if reason := _run(tool, [plain], converted):
             raise OutputError(f"{path}: {TOOL} does not write it ({reason})")
+        kind = next(kind for kind, (_, suffix) in EXCHANGE.items() if suffix == ending)
+        if kind != "sog" and _mode(plain) == "antialiased" and not _mode(converted, kind):  # the versions that write SOG say it
+            mark_antialiased(converted)
         shutil.copyfile(converted, temporary)
     return path
 
@@ -252,6 +257,25 @@ def _settle_frame(tool: Sequence[str], file: Path, ply: Path) -> None:
         from mipmap_plugin.formats.half_turn import half_turned  # and NumPy, without which options are read
 
         half_turned(ply)
+
+
+def _settle_mode(mode: str | None, ply: Path) -> None:
+    """Say in a converted PLY how the file that it was made of is to be drawn, which splat-transform does itself since 3.0."""
+    if mode not in ("antialiased", "2dgs") or _mode(ply):
+        return
+    from mipmap_plugin.formats.ply import read_ply, write_ply  # as above
+
+    plain = read_ply(ply)
+    write_ply(ply, plain.columns, [*plain.comments, f"SplatRenderMode: {'mip' if mode == 'antialiased' else mode}"], overwrite=True)
+
+
+def _mode(file: Path, kind: str = "ply") -> str | None:
+    """How a file says that it is to be drawn (`render_mode`)."""
+    if kind not in ("ply", "compressed"):
+        return mode_in_exchange(file, kind)
+    from mipmap_plugin.formats.ply import read_header
+
+    return render_mode(read_header(file).comments)
 
 
 def is_glb(path: Path) -> bool:

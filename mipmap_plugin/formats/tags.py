@@ -1,11 +1,15 @@
-"""Header comments that name the screen filter and the provenance of a splat file."""
+"""Header comments that name the screen filter and the provenance of a splat file, and what exchange formats have in their place."""
 
 from __future__ import annotations
 
+import gzip
 import json
 import math
 import re
+import zipfile
+import zlib
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.screen_filters import COMPENSATED, SCREEN_FILTERS
@@ -31,6 +35,49 @@ _MODES = {"default": "classic", "0": "classic", "mip": "antialiased", "1": "anti
 
 # The tag of each screen filter. Filters that integrate over the pixel have none, as no other project's files name them.
 _TAGS = {"classic": "default", "antialiased": "mip", "mip": "mip", "surfel": "2dgs"}
+
+# Where the flags of an SPZ are, in all its versions, and the one of splats that were trained antialiased (nianticlabs/spz, load-spz.cc).
+_SPZ_FLAGS, _SPZ_ANTIALIASED = 14, 1
+
+# The most bytes that are read of a SOG's meta.json.
+_MOST_OF_META = 1 << 20
+
+
+def mode_in_exchange(path: Path, kind: str) -> str | None:
+    """How an SPZ or SOG (`kind`) says that it is to be drawn, as `render_mode` of a PLY; None if it does not say."""
+    try:
+        if kind == "spz":
+            with path.open("rb") as file:
+                head = file.read(_SPZ_FLAGS + 1)
+                if head.startswith(b"\x1f\x8b"):
+                    file.seek(0)
+                    head = gzip.GzipFile(fileobj=file).read(_SPZ_FLAGS + 1)
+            return "antialiased" if head.startswith(b"NGSP") and head[_SPZ_FLAGS] & _SPZ_ANTIALIASED else None
+        model = _meta_of_sog(path).get("model") if kind == "sog" else None
+        return model if model in ("antialiased", "2dgs") else None
+    except (OSError, EOFError, ValueError, LookupError, AttributeError, TypeError, RecursionError, zlib.error, zipfile.BadZipFile):
+        return None  # damaged, of which whoever reads its splats tells
+
+
+def mark_antialiased(file: Path) -> None:
+    """Say in an SPZ, of version 3 or older, or else in the header of a PLY, that its splats are to be drawn antialiased."""
+    content = bytearray(file.read_bytes())
+    if content.startswith(b"\x1f\x8b"):
+        content = bytearray(gzip.decompress(content))
+        content[_SPZ_FLAGS] |= _SPZ_ANTIALIASED
+        file.write_bytes(gzip.compress(content, mtime=0))
+    else:
+        file.write_bytes(content.replace(b"element ", b"comment SplatRenderMode: mip\nelement ", 1))
+
+
+def _meta_of_sog(path: Path) -> Any:
+    """The content of a SOG's meta.json, which is the file itself or in an archive."""
+    if not zipfile.is_zipfile(path):
+        return json.loads(path.read_bytes()[:_MOST_OF_META])
+    with zipfile.ZipFile(path) as archive:
+        name = next(name for name in archive.namelist() if name.rpartition("/")[2] == "meta.json")
+        with archive.open(name) as file:
+            return json.loads(file.read(_MOST_OF_META))
 
 
 def render_mode(comments: Iterable[str]) -> str | None:

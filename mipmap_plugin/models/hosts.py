@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -38,7 +38,14 @@ class Host(Protocol):
         """The subfolder that `write` creates in a result folder at `path`; None if `path` is a file. Raises OutputError."""
 
     def as_trained(self, cameras: Sequence[Camera], capture: Capture, means: Tensor) -> list[Camera]:
-        """The cameras of a scene in the coordinate frame and at the image size of the training.
+        """The cameras of a scene in the coordinate frame, at the image size and with the test views of the training.
 
         `means` [N, 3] are those of the splats. Raises SceneError.
         """
+
+
+def held_out(cameras: Sequence[Camera], tests: Collection[int]) -> list[Camera]:
+    """The cameras, of which those at the places `tests` in the order of their names are for testing, and all others for training."""
+    by_name = sorted(range(len(cameras)), key=lambda number: cameras[number].name)
+    chosen = {by_name[place] for place in tests}
+    return [replace(camera, split="test" if number in chosen else "train") for number, camera in enumerate(cameras)]

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,7 +24,7 @@ from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import OPACITY_MARGIN
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.health import without_invalid
-from mipmap_plugin.models.hosts import Capture
+from mipmap_plugin.models.hosts import Capture, held_out
 from mipmap_plugin.models.places import SPLATFACTO
 from mipmap_plugin.models.tagged import as_tagged
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
@@ -78,7 +80,15 @@ class SplatfactoHost:
         return None
 
     def as_trained(self, cameras: Sequence[Camera], capture: Capture, means: Tensor) -> list[Camera]:
-        """Transform the cameras by dataparser_transforms.json, and shrink large images as nerfstudio does. Raises SceneError."""
+        """Transform the cameras by dataparser_transforms.json, and shrink large images as nerfstudio does. Raises SceneError.
+
+        Those views are for testing that the config holds out, unless the scene says it: a transforms.json by its lists, and COLMAP's every eighth are
+        those of nerfstudio's own reader of COLMAP.
+        """
+        names, mode = [camera.name for camera in cameras], self.options.get("eval_mode")
+        said = any(camera.split == "test" for camera in cameras) if capture.points is None else mode in (None, "interval")
+        if not said and len(set(names)) == len(names):
+            cameras = held_out(cameras, _tests(names, self.options))
         frame = self._frame()
         frame[:3] /= capture.applied_scale  # contained in the file's scale, but already applied to the poses
         factor = _factor(cameras, self.options.get("downscale_factor"), capture)
@@ -177,6 +187,19 @@ def _unusual_options(pipeline: Mapping[str, Any], options: dict[str, Any]) -> li
     if options.get("use_bilateral_grid"):
         notes.append("trained with a bilateral grid: nerfstudio regrades each training view by its own, which is not applied here")
     return notes
+
+
+def _tests(names: list[str], options: dict[str, Any]) -> list[int]:
+    """The places of the test views in the order of `names` (data/utils/dataparsers_utils.py); none if the config does not tell."""
+    count, interval, share = len(names), options.get("eval_interval"), options.get("train_split_fraction")
+    match options.get("eval_mode"):
+        case "fraction" if isinstance(share, (int, float)) and 0 < share <= 1:
+            return sorted({*range(count)} - {*np.linspace(0, count - 1, math.ceil(count * share), dtype=int).tolist()})
+        case "interval" if isinstance(interval, int) and interval > 0:
+            return list(range(0, count, interval))
+        case "filename":
+            return [place for place, name in enumerate(sorted(names)) if "eval" in name and "train" not in name]
+    return []
 
 
 def _factor(cameras: Sequence[Camera], downscale_factor: Any, capture: Capture) -> float:

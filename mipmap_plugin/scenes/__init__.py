@@ -31,7 +31,8 @@ def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     """The scene at `path`: a model folder with a cameras.json, that file itself, a transforms file of any name or its folder, a COLMAP
     scene, one of DyNeRF or HyperNeRF as 4DGaussians reads them, or a PLY that has a camera in it (`cameras_in`).
 
-    `cfg` is the checkpoint's cfg_args, which determine the test split and training size (`read_cameras`, `read_colmap`). A folder
+    `cfg` is the checkpoint's cfg_args, which determine the test split and training size (`read_cameras`, `read_colmap`, `read_transforms`), and
+    the frame of HyperNeRF's captures: Deformable 3D Gaussians moves and scales them. A folder
     with both COLMAP's `sparse` and transforms files is read from `sparse`, as graphdeco-inria does.
     Raises SceneError.
     """
@@ -45,11 +46,11 @@ def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     if (path / "sparse").is_dir():
         return read_colmap(path, cfg)
     if any(path.glob("transforms*.json")):
-        return read_transforms(path)
+        return read_transforms(path, cfg)
     if is_dynerf(path):
         return read_dynerf(path)
     if is_hypernerf(path):
-        return read_hypernerf(path)
+        return read_hypernerf(path, cfg)
     if is_colmap(path):
         return read_colmap(path, cfg)
     advice = f"give the folder or file that has the cameras{f', such as {found[0]}' if (found := _near(path)) else ''}"
@@ -80,7 +81,7 @@ def _of_file(path: Path, cfg: dict[str, Any] | None) -> Scene:
         raise SceneError(f"{path}: is no file of cameras that is read here (cameras.json, a transforms.json, or the folder of a COLMAP model){there}")
     data = read_json(path)
     if path.name.startswith("transforms") or (isinstance(data, dict) and "frames" in data):
-        return read_transforms(path)
+        return read_transforms(path, cfg)
     if isinstance(data, dict):
         raise SceneError(f"{path}: has no cameras: neither the frames of a transforms.json nor the list of a cameras.json; give one of these")
     return _cameras_only(path, path, cfg)

@@ -20,6 +20,9 @@ from mipmap_plugin.scenes.lenses import Lens
 # The word of notes on photographs that are not there.
 ABSENT = "absent"
 
+# The words of notes on which views are taken to be for testing.
+SPLIT = "is for testing"
+
 # How far the ratio of a photograph's sides may be from that of its camera: copies are rounded to whole pixels, some to multiples.
 SHAPE_TOLERANCE = 0.1
 

@@ -105,6 +105,14 @@ def count_test_cameras(names: list[str]) -> int:
     return math.ceil(len(names) / TEST_EVERY)
 
 
+def numbers_views(cfg: dict[str, Any], split: str) -> bool:
+    """Whether a view of a scene has a number in the training (`Camera.index`): only a model with appearances asks for it.
+
+    Without `eval` all views were trained on. With the option `lod` of Scaffold-GS the split is another, and numbers are not known.
+    """
+    return bool(cfg.get("appearance_dim")) and not cfg.get("lod") and (split == "train" or not cfg.get("eval"))
+
+
 def photographs_folder(cfg: dict[str, Any]) -> str:
     """The name of the folder of training photographs. Octree-GS, which has the option `fork`, uses `ds` instead of `images`."""
     ds = cfg.get("ds", 1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -12,8 +14,8 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError, brief
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import pixels
-from mipmap_plugin.scenes.base import ABSENT, Scene, refuse_other_shape
-from mipmap_plugin.scenes.cameras_json import TEST_EVERY, photographs_folder, trained_size
+from mipmap_plugin.scenes.base import ABSENT, SPLIT, Scene, refuse_other_shape
+from mipmap_plugin.scenes.cameras_json import TEST_EVERY, numbers_views, photographs_folder, trained_size
 from mipmap_plugin.scenes.colmap_sizes import refuse_truncated
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, note
 
@@ -49,9 +51,12 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         raise SceneError(f"{path}: the COLMAP model has names of images that are no UTF-8; copy or export it again") from error
     if not images:
         raise SceneError(f"{path}: the COLMAP model has no image with a pose; run the mapper again")
+    if nameless := [image.image_id for image in images if not Path(image.name).name]:
+        raise SceneError(f"{path}: image {nameless[0]} of the COLMAP model has no name; copy or export it again")
     cameras: list[Camera] = []
     photographs: dict[Camera, Path] = {}
     lenses: dict[Path, Lens] = {}
+    trained = count()
     for index, image in enumerate(images):
         camera = _camera(model, image, "train" if index % TEST_EVERY else "test", centered=bool(cfg))
         photograph, lens = folder / image.name, _lens(model.cameras[image.camera_id])
@@ -62,7 +67,10 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
             camera, lens = camera.resized(*size), lens and lens.at(size)
         if lens is not None:
             camera, lenses[photograph] = lens.straightened(camera), lens
+            camera = replace(camera, cx=camera.width / 2, cy=camera.height / 2) if cfg else camera
         camera = camera.resized(*trained_size(camera.width, camera.height, options))
+        if numbers_views(cfg, camera.split):
+            camera = replace(camera, index=next(trained))
         cameras.append(camera)
         if exists:
             photographs[camera] = photograph
@@ -127,6 +135,8 @@ def _lens(camera: pycolmap.Camera) -> Lens | None:
 def _camera(model: pycolmap.Reconstruction, image: pycolmap.Image, split: Literal["train", "test"], *, centered: bool) -> Camera:
     """The camera at COLMAP's size. `centered`: the principal point is moved to the center."""
     lens = model.cameras[image.camera_id]
+    if not lens.focal_length_idxs():
+        raise SceneError(f"{image.name}: has a lens that is not perspective ({lens.model.name}); resample its images to a pinhole first")
     viewmat = torch.eye(4, dtype=torch.float64)
     pose = image.cam_from_world()
     pose.rotation.normalize()  # as COLMAP does when it reads a text file, and pycolmap does not
@@ -143,7 +153,7 @@ def _points(model: pycolmap.Reconstruction) -> Tensor | None:
 
 
 def _notes(cameras: list[Camera], photographs: dict[Camera, Path], folder: Path, cfg: dict[str, Any]) -> list[str]:
-    notes = [f"{len(cameras)} cameras in the order of their names: every {TEST_EVERY}th is for testing, the others for training"]
+    notes = [f"{len(cameras)} cameras in the order of their names: every {TEST_EVERY}th {SPLIT}, the others for training"]
     if absent := len(cameras) - len(photographs):
         notes.append(f"{absent} of {len(cameras)} photographs of the COLMAP model are {ABSENT} from {folder}; their cameras are views without one")
     if cfg and not cfg.get("eval"):

@@ -1,6 +1,7 @@
 """Scenes of 4DGaussians without transforms files: DyNeRF's videos (poses_bounds.npy) and HyperNeRF's captures (dataset.json).
 
-Poses, intrinsics, sizes, times and splits are those of that project's scene/neural_3D_dataset_NDC.py and scene/hyper_loader.py.
+Poses, intrinsics, sizes, times and splits are those of that project's scene/neural_3D_dataset_NDC.py and scene/hyper_loader.py; and those of
+scene/dataset_readers.py in Deformable 3D Gaussians (`readNerfiesCameras`).
 """
 
 from __future__ import annotations
@@ -16,13 +17,19 @@ from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.images import image_size, is_file, read_array
 from mipmap_plugin.formats.json_file import numbers, pixels, positive, present, read_json, rotation
 from mipmap_plugin.scenes.base import Scene
+from mipmap_plugin.scenes.cameras_json import trained_size
 from mipmap_plugin.scenes.transforms import viewmat_from_opengl
 
 # DyNeRF: px of the recorded width, to which focal lengths refer, and of the training size; and the number of frames of a video.
 RECORDED, WIDTH, HEIGHT, FRAMES = 2704, 1352, 1014, 300
 
-# HyperNeRF: folder of the photographs at half size; without a list of test views, every fourth view is for training.
-HALF, EVERY = "2x", 4
+# HyperNeRF: photographs are taken at half their size; without a list of test views, every fourth view is for training.
+HALF, EVERY = 2, 4
+
+# An option in the cfg_args of Deformable 3D Gaussians that no other project has which reads these captures.
+DEFORMABLE = "is_6dof"
+
+View = tuple[str, Literal["train", "test"]]  # its name and split
 
 
 def is_dynerf(path: Path) -> bool:
@@ -58,26 +65,35 @@ def read_dynerf(path: Path) -> Scene:
     return Scene(tuple(cameras), images, path, notes)
 
 
-def read_hypernerf(path: Path) -> Scene:
-    """The training and test views of a capture, at half its size. Raises SceneError."""
+def read_hypernerf(path: Path, cfg: dict[str, Any] | None = None) -> Scene:
+    """The training and test views of a capture as 4DGaussians reads them, at half its size.
+
+    With the cfg_args (`cfg`) of Deformable 3D Gaussians, as that does: from the scene's center, in its scale, by another time, and in a size
+    and with a split by the name of the folder above. Raises SceneError.
+    """
+    cfg, deformable = cfg or {}, DEFORMABLE in (cfg or {})
     listed, facts = (_object(path / name) for name in ("dataset.json", "metadata.json"))
-    names = _names(listed, "ids", path)
-    warps = [_warp(facts.get(name), f"{path / 'metadata.json'}, {name}") for name in names]
-    last = max(warps, default=0) or 1.0
+    names, key = _names(listed, "ids", path), "time_id" if deformable else "warp_id"
+    shrunk, chosen = _of_deformable(path, listed, names) if deformable else (HALF, _chosen(path, listed, names))
+    moments = {name: _moment(facts.get(name), key, f"{path / 'metadata.json'}, {name}") for name in (dict(chosen) if deformable else names)}
+    last = max(moments.values(), default=0) or 1.0
+    frame, resolution = (_frame(path / "scene.json"), cfg.get("resolution", 1)) if deformable else (None, 1)
     cameras: list[Camera] = []
     images: dict[Camera, Path] = {}
-    tests, trains = _names(listed, "val_ids", path), _names(listed, "train_ids", path)
-    for name, split, warp in _chosen(names, set(tests), set(trains), warps):
-        photograph = path / "rgb" / HALF / f"{name}.png"
-        camera = _of_capture(path / "camera" / f"{name}.json", name, split, warp / last)
+    for name, split in chosen:
+        photograph = path / "rgb" / f"{shrunk}x" / f"{name}.png"
+        held_out = split == "test" and (not deformable or bool(cfg.get("eval")))
+        camera = _of_capture(path / "camera" / f"{name}.json", name, "test" if held_out else "train", moments[name] / last)
+        camera = camera if frame is None else camera.moved(frame)
         exists = is_file(photograph)
-        camera = camera.resized(*(image_size(photograph) if exists else (camera.width // 2, camera.height // 2)))
+        size = image_size(photograph) if exists else (max(1, camera.width // shrunk), max(1, camera.height // shrunk))
+        camera = camera.resized(*trained_size(*size, {"resolution": resolution}))
         cameras.append(camera)
         if exists:
             images[camera] = photograph
     if not cameras:
         raise SceneError(f"{path / 'dataset.json'}: lists no view; copy it again")
-    return Scene(tuple(cameras), images, path, [f"{len(cameras)} of {len(names)} views of a HyperNeRF capture, at half its size"])
+    return Scene(tuple(cameras), images, path, [f"{len(cameras)} of {len(names)} views of a HyperNeRF capture, at 1/{shrunk} of its size"])
 
 
 def _of_video(pose: Tensor, video: str, moment: int, split: Literal["train", "test"], where: str) -> Camera:
@@ -105,20 +121,40 @@ def _names(listed: dict[str, Any], key: str, path: Path) -> list[str]:
     return names
 
 
-def _warp(entry: Any, where: str) -> float:
+def _moment(entry: Any, key: str, where: str) -> float:
     """The moment of a view, at least 0."""
-    value = numbers(present(entry if isinstance(entry, dict) else {}, "warp_id", where), (), f"{where}, warp_id").item()
+    value = numbers(present(entry if isinstance(entry, dict) else {}, key, where), (), f"{where}, {key}").item()
     if value < 0:
-        raise SceneError(f"{where}, warp_id: is {value:g} but must be at least 0; correct the file")
+        raise SceneError(f"{where}, {key}: is {value:g} but must be at least 0; correct the file")
     return value
 
 
-def _chosen(names: list[str], tests: set[str], trains: set[str], warps: list[float]) -> list[tuple[str, Literal["train", "test"], float]]:
-    """The training and test views; the others are left out."""
+def _chosen(path: Path, listed: dict[str, Any], names: list[str]) -> list[View]:
+    """The training and test views of 4DGaussians; the others are left out."""
+    tests, trains = set(_names(listed, "val_ids", path)), set(_names(listed, "train_ids", path))
     if not tests:
         trains, tests = set(names[::EVERY]), set(names[EVERY // 2 :: EVERY])
-    both = list(zip(names, warps, strict=True))
-    return [(name, "train", warp) for name, warp in both if name in trains] + [(name, "test", warp) for name, warp in both if name in tests]
+    return [(name, "train") for name in names if name in trains] + [(name, "test") for name in names if name in tests]
+
+
+def _of_deformable(path: Path, listed: dict[str, Any], names: list[str]) -> tuple[int, list[View]]:
+    """By how much Deformable 3D Gaussians shrinks the photographs, and its training and test views."""
+    above = path.absolute().parent.name
+    shrunk = 4 if above.startswith("vrig") else 1 if above.startswith("NeRF") else HALF
+    trains, tests = names[::EVERY], names[EVERY // 2 :: EVERY] if above.startswith("interp") else []
+    if shrunk != HALF:
+        trains, tests = _names(listed, "train_ids", path), _names(listed, "val_ids", path)
+    return shrunk, [(name, "train") for name in trains] + [(name, "test") for name in tests]
+
+
+def _frame(file: Path) -> Tensor:
+    """The similarity [4, 4] float64 from the world of a capture to the one that is centered and scaled by its scene.json."""
+    data, frame = _object(file), torch.eye(4, dtype=torch.float64)
+    center = numbers(present(data, "center", str(file)), (3,), f"{file}, center")
+    scale = positive(present(data, "scale", str(file)), f"{file}, scale")
+    frame[:3] *= scale
+    frame[:3, 3] = -scale * center
+    return frame
 
 
 def _of_capture(file: Path, name: str, split: Literal["train", "test"], time: float) -> Camera:

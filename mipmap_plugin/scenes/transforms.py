@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
+from dataclasses import replace
+from itertools import count
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import torch
@@ -15,6 +17,7 @@ from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import ROTATION_TOLERANCE, numbers, pixels, positive, present, read_json, rotation
 from mipmap_plugin.scenes.base import ABSENT, Scene, refuse_other_shape
+from mipmap_plugin.scenes.cameras_json import numbers_views, trained_size
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, can_undistort, note
 
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
@@ -31,15 +34,17 @@ MIN_ANGLE = 1e-9
 View = tuple[Camera, Path | None, Lens | None]  # a camera, its image if there is one, and its lens if that has to be undistorted
 
 
-def read_transforms(path: str | Path) -> Scene:
+def read_transforms(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     """The scene of a folder with transforms files, or of one such file.
 
+    `cfg` is the checkpoint's cfg_args, whose `resolution` determines the training size; the principal point is moved to the center, as projects
+    with cfg_args do. Without it the size is that of the images.
     `transforms_test.json` is the test split, or `transforms_val.json` if there is none; in a file that lists the frames of training
     (`train_filenames`), as nerfstudio's may, all others are. A frame whose image is missing stays a
     view if the file states its size (`w`, `h`), and is left out otherwise; `notes` count both.
 
     Raises:
-        SceneError: no transforms file, no usable frame, a lens that is not perspective, or an entry that cannot be read.
+        SceneError: no transforms file, no usable frame, a lens that is not perspective, an entry that cannot be read, or an invalid `resolution`.
     """
     path = Path(path)
     views: list[View] = []
@@ -53,6 +58,8 @@ def read_transforms(path: str | Path) -> Scene:
             notes.append(f"{file.name}: {_counted(absent)} {ABSENT}{_left_out(unsized)}")
     if not views:
         raise SceneError(f"{path}: none of the listed images is there, and the sizes are unknown; add the images, or w and h to the file")
+    if cfg:
+        views = _as_trained(views, cfg)
     cameras, distorted = tuple(camera for camera, _, _ in views), [lens for _, _, lens in views if lens]
     images = {camera: image for camera, image, _ in views if image}
     lenses = {image: lens for _, image, lens in views if image and lens}
@@ -86,6 +93,22 @@ def _first_file(folder: Path, *names: str) -> list[Path]:
     return [folder / name for name in names if (folder / name).is_file()][:1]
 
 
+def _as_trained(views: list[View], cfg: dict[str, Any]) -> list[View]:
+    """The views as projects with cfg_args take them: at their training size, with the principal point in the middle.
+
+    4DGaussians, which has the option `kplanes_config`, takes no notice of `resolution`, and divides all times by the last one.
+    """
+    is_4dgs = "kplanes_config" in cfg
+    last = (max((camera.time or 0.0 for camera, _, _ in views)) if is_4dgs else 0.0) or 1.0
+    trained, numbers = list[View](), count()
+    for camera, image, lens in views:
+        size = trained_size(camera.width, camera.height, {"resolution": 1 if is_4dgs else cfg.get("resolution", 1)})
+        time = None if camera.time is None else camera.time / last
+        index = next(numbers) if numbers_views(cfg, camera.split) else None
+        trained.append((replace(camera.resized(*size), cx=size[0] / 2, cy=size[1] / 2, time=time, index=index), image, lens))
+    return trained
+
+
 def _counted(absent: int) -> str:
     return f"{absent} listed images are" if absent > 1 else "1 listed image is"
 
@@ -106,7 +129,7 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
         lacks = "has no list of 'frames'" if frames != [] else "lists no frames"
         raise SceneError(f"{file}: {lacks}; give a NeRF-Synthetic, instant-ngp or nerfstudio transforms file")
     views: list[View] = []
-    absent, trained = 0, data.get("train_filenames")
+    absent, trained = 0, {_place(str(name)) for name in names} if isinstance(names := data.get("train_filenames"), list) else None
     for index, frame in enumerate(frames):
         where = f"{file}, frame {index}"
         if not isinstance(frame, dict):
@@ -119,7 +142,7 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
         actual = image_size(image) if image else stated  # the image may have been shrunk since
         if actual:
             name = image.stem if image else _stem(listed.replace("\\", "/").rsplit("/", 1)[-1])
-            split = split if not isinstance(trained, list) else "train" if listed in trained else "test"
+            split = split if trained is None else "train" if _place(listed) in trained else "test"
             if stated:
                 refuse_other_shape(stated, actual, f"{where} ({name})")
             model = _lens_model(values, f"{where} ({name})")
@@ -137,6 +160,11 @@ def _applied(file: Path) -> tuple[Tensor | None, float]:
     elif file.name == "transforms.json" and (file.parent / "colmap/sparse/0").exists():
         transform = _pose(USUAL_TURN, str(file))
     return transform, positive(data.get("applied_scale", 1.0), f"{file}, applied_scale")
+
+
+def _place(listed: str) -> PurePosixPath:
+    """A listed name of a file, by which `./a` is the same as `a`."""
+    return PurePosixPath(listed.replace("\\", "/"))
 
 
 def _image(folder: Path, listed: str) -> Path | None:

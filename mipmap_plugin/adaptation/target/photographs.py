@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -16,6 +17,7 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models.base import Placed, SplatModel
 from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.scenes import Scene
+from mipmap_plugin.scenes.base import SPLIT
 
 
 class Photographs:
@@ -51,18 +53,29 @@ def at_density_of(cameras: Sequence[Camera], base: Sequence[Camera]) -> list[Cam
     """The cameras as views of the base scale (their `zoom` stays): each at the pixel density of the base's view of that name.
 
     Cameras that the base does not have get the density of those of the most similar field of view: trainings shrink images of other sizes
-    by other factors, such as upright and wide ones of the same lens to the same width.
+    by other factors, such as upright and wide ones of the same lens to the same width. The principal point is in the middle where that of the base's
+    view is: 3DGS takes it to be there whatever the scene says, and the base shows its scene so. A training view's number is that of the base's view
+    (`Camera.index`), so that it keeps its own appearance.
     """
     kinds, named = {(*view.size, view.fx, view.fy): view for view in base}, defaultdict[str, list[Camera]](list)
     for view in base:
         named[Path(view.name).stem].append(view)  # several, where images of several folders have the same names
 
     def at_density(camera: Camera) -> Camera:
-        views = named.get(Path(camera.name).stem) or kinds.values()
-        ratio = min(views, key=lambda view: _difference(view, camera)).fx / camera.fx
-        return camera.resized(max(1, round(camera.width * ratio)), max(1, round(camera.height * ratio)))
+        own = named.get(Path(camera.name).stem, [])
+        view = min(own or kinds.values(), key=lambda view: _difference(view, camera))
+        ratio = view.fx / camera.fx
+        resized = camera.resized(max(1, round(camera.width * ratio)), max(1, round(camera.height * ratio)))
+        if camera.index is None and len(own) == 1 and view.split == camera.split:
+            resized = replace(resized, index=view.index)
+        return replace(resized, cx=resized.width / 2, cy=resized.height / 2) if _is_centered(view) else resized
 
     return [*map(at_density, cameras)]
+
+
+def _is_centered(camera: Camera) -> bool:
+    """Whether the principal point is in the middle of the picture, but for rounding."""
+    return math.isclose(2 * camera.cx, camera.width) and math.isclose(2 * camera.cy, camera.height)
 
 
 def _difference(one: Camera, other: Camera) -> float:
@@ -72,9 +85,13 @@ def _difference(one: Camera, other: Camera) -> float:
 
 
 def placed(model: SplatModel, scene: Scene) -> Scene:
-    """The scene in the frame that the model was trained in: gsplat and splatfacto transform it. Raises SceneError."""
+    """The scene in the frame that the model was trained in, and with its test views: gsplat and splatfacto transform it. Raises SceneError."""
     if not model.traits.placed:
         return scene
     scene = scene.original()
     capture = Capture(scene.points, scene.smaller if scene.images else None, scene.applied_scale)
-    return scene.with_cameras(cast(Placed, model).as_trained(scene.cameras, capture))
+    there = scene.with_cameras(cast(Placed, model).as_trained(scene.cameras, capture))
+    if [camera.split for camera in there.cameras] == [camera.split for camera in scene.cameras]:
+        return there
+    tests = f"the checkpoint's options hold out {len(there.split('test'))} of {len(there.cameras)} views: these are for testing"
+    return replace(there, notes=[*(note for note in there.notes if SPLIT not in note), tests])

@@ -29,7 +29,7 @@ def run(model: Wrapped, scene: Scene | None, scales: Sequence[float], plan: Plan
     truths = [base_itself(model, scale, views) if scene is None else photographs(model, scene, scale, views) for scale in scales]
     made_from = {"base": model.model.digest, "asked": model.asked, "trained": str(model.trained), "scene": scene and scene.digest()}
     cells = Cells(folder.path / KEPT, made_from | {"views": views, "threads": model.threads})
-    notes = left_out(model, plan) + ([*scene.notes, *not_exposed(model.model)] if scene else [])
+    notes = left_out(model, plan) + ([*model.place(scene).notes, *not_exposed(model.model)] if scene else [])
     tradeoffs = [Tradeoff(scale, truth.label, [], notes) for scale, truth in zip(scales, truths, strict=True)]
     try:
         for tradeoff, truth in zip(tradeoffs, truths, strict=True):

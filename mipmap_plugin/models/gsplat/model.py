@@ -23,7 +23,7 @@ from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.gsplat.frame import normalized_frame
 from mipmap_plugin.models.health import without_invalid
-from mipmap_plugin.models.hosts import Capture
+from mipmap_plugin.models.hosts import Capture, held_out
 from mipmap_plugin.models.places import GSPLAT
 from mipmap_plugin.models.surfels import NOTE as FLAT_NOTE
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
@@ -73,8 +73,11 @@ class GsplatHost:
         return None if path.suffix == ".pt" else "ckpts"
 
     def as_trained(self, cameras: Sequence[Camera], capture: Capture, means: Tensor) -> list[Camera]:
-        """The cameras resized by `data_factor`, in the normalized frame, which is recomputed from the cameras and points."""
-        points, resized = capture.points, _shrunk(cameras, int(_positive(self.options, "data_factor", 1)), capture)
+        """The cameras resized by `data_factor`, in the normalized frame, which is recomputed from the cameras and points.
+
+        Those of which `test_every` tells are for testing.
+        """
+        points, resized = capture.points, _shrunk(self._split(cameras), int(_positive(self.options, "data_factor", 1)), capture)
         if not self.options.get("normalize_world_space", True):  # always on before version 1.4, which had no such option
             return resized
         if points is None:
@@ -85,6 +88,10 @@ class GsplatHost:
             raise SceneError(f"gsplat trained in a normalized coordinate frame, which is computed from the points of COLMAP: {advice}; {own}")
         frame = normalized_frame(cameras, points, means)
         return [camera.moved(frame) for camera in resized]
+
+    def _split(self, cameras: Sequence[Camera]) -> Sequence[Camera]:
+        every = self.options.get("test_every")
+        return held_out(cameras, range(0, len(cameras), every)) if type(every) is int and every > 0 else cameras
 
     def _write_options(self, folder: Path, *, antialiased: bool) -> None:
         source = _options_file(self.folder)
