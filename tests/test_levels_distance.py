@@ -353,6 +353,8 @@ def test_a_ladder_from_end_to_end(tmp_path, small_chunks, capsys):
     assert [point["zoom"] for point in manifest["curve"]] == pytest.approx([near / point["pixel"] for point in manifest["curve"]])
     keyed = {zoom: psnr for level in manifest["levels"] for zoom, psnr in level["psnr_db"].items()}
     assert keyed == {f"{point['zoom']:.4g}": point["psnr_db"] for point in manifest["curve"]}
+    seconds = dict(ladder.levels[-1].report.seconds)
+    assert sum(seconds.values()) == pytest.approx(2 * seconds["total"])  # of all phases
     print_summary(folder, manifest)
     assert "3 levels by distance" in capsys.readouterr().out
 
