@@ -691,6 +691,22 @@ def test_a_damaged_plan_is_said_in_a_sentence(job):
         adapt_in_tiles(job, 2)
 
 
+def test_views_that_show_nothing_are_refused_and_leave_no_folder(job):
+    """The corrected command is another request, which a folder of this one would refuse."""
+    around = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
+    views = [replace(view, viewmat=around @ view.viewmat) for view in tiny.cameras(3, width=20, height=16)]
+    folder = tiny.folder(job.base.checkpoint.with_name("other"), views)
+    with pytest.raises(SettingsError, match="none of the 3 views shows a splat: the cameras seem to be of another scene"):
+        adapt_in_tiles(replace(job, base=replace(job.base, cameras=folder / "cameras.json")), 2)
+    assert not work_folder(job.target).exists()
+
+
+def test_what_is_wrong_with_views_is_told(job, monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.adaptation.views.UNLIKE", 0.5)
+    with pytest.warns(UserWarning, match="adapt with the cameras of each lens on their own"):
+        adapt_in_tiles(replace(job, settings=job.settings | {"steps": 0}), 2)
+
+
 def test_an_output_is_not_replaced_unasked(job):
     job.target.write_text("here")
     with pytest.raises(OutputExists):
