@@ -587,6 +587,11 @@ def test_the_result_does_not_depend_on_what_was_done_before(job, monkeypatch):
     assert read_ply(joined.file).columns["f_rest_0"].tobytes() == read_ply(undisturbed).columns["f_rest_0"].tobytes()
 
 
+def test_no_tile_grows_beyond_what_the_settings_allow(job):
+    settings = dict(steps=8, prune_every=2, densify_gradient=1e-9, most_growth=1.2, views="given", validation_views=2)
+    assert 80 < adapt_in_tiles(replace(job, recipe="paper", settings=settings), 2).report.gaussians_after <= 96
+
+
 def test_an_interrupted_tile_is_resumed(job, monkeypatch):
     def interrupt_early(run, task, config, on_interrupt, observe):
         return real_adapt(run, task, config, on_interrupt, lambda run: on_interrupt(run) if run.step == 2 else observe(run))
