@@ -13,6 +13,7 @@ import pytest
 import tiny
 import torch
 
+from mipmap_plugin.adaptation.optimization import loop
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.loop import adapt as real_adapt
 from mipmap_plugin.adaptation.report import AS_IT_IS
@@ -585,6 +586,15 @@ def test_the_result_does_not_depend_on_what_was_done_before(job, monkeypatch):
     assert set(before) == {"finished before"}
     assert read_ply(joined.file).columns["x"].tobytes() == read_ply(undisturbed).columns["x"].tobytes()
     assert read_ply(joined.file).columns["f_rest_0"].tobytes() == read_ply(undisturbed).columns["f_rest_0"].tobytes()
+
+
+def test_the_bar_of_a_tile_says_which_it_is_and_no_db(job, monkeypatch):
+    """Which it has not: it is measured as a part of the whole."""
+    told, began = [], loop.Bar.__init__
+    monkeypatch.setattr(loop.Bar, "__init__", lambda bar, **options: (told.append(options["desc"]), began(bar, **options))[1])
+    monkeypatch.setattr(loop.Bar, "set_postfix_str", lambda bar, text: told.append(text))
+    adapt_in_tiles(replace(job, settings=job.settings | {"closed_form": False, "steps": 2}), 2)
+    assert set(told) == {"adapting tile 1 x0.5", "adapting tile 2 x0.5", "40 splats"}
 
 
 def test_no_tile_grows_beyond_what_the_settings_allow(job):

@@ -92,7 +92,7 @@ class Tile:
         most = sys.maxsize if growth is None else int(growth * len(Store(start)))
         return Task(
             views, 1.0, around.wanted, around.render, white, validation, max_splats=most, render_views=around.render_views,
-            render_to_step=around.to_step,
+            render_to_step=around.to_step, part=f"tile {self.number + 1} x{self.scene.scale:g}",
         )  # fmt: skip
 
     def _fingerprint(self) -> str:
