@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -593,8 +594,9 @@ def test_the_bar_of_a_tile_says_which_it_is_and_no_db(job, monkeypatch):
     told, began = [], loop.Bar.__init__
     monkeypatch.setattr(loop.Bar, "__init__", lambda bar, **options: (told.append(options["desc"]), began(bar, **options))[1])
     monkeypatch.setattr(loop.Bar, "set_postfix_str", lambda bar, text: told.append(text))
+    monkeypatch.setattr(run, "announced", lambda what: (told.append(what), nullcontext())[1])
     adapt_in_tiles(replace(job, settings=job.settings | {"closed_form": False, "steps": 2}), 2)
-    assert set(told) == {"adapting tile 1 x0.5", "adapting tile 2 x0.5", "40 splats"}
+    assert set(told) == {"cutting", "adapting tile 1 x0.5", "adapting tile 2 x0.5", "40 splats", "measuring the whole", "writing out.ply"}
 
 
 def test_no_tile_grows_beyond_what_the_settings_allow(job):

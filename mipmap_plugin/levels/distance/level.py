@@ -133,8 +133,9 @@ class LevelRun:
             self.seconds["pseudo truth"], self.seconds["validation"] = run.costs.sums()
             self.seconds["optimization"] = run.watch.seconds - self.seconds["total"] - run.costs.seconds()
             curve, kept, self.seconds["total"] = run.curve, keeper.remaining_file(), run.watch.seconds
-        best, psnrs = self.validation.choose(states)
-        psnrs[AS_FINER] = self._as_finer(lambda finer: self.validation.viewer_psnrs(finer, self.validation.choosing)[0])
+        with announced(f"level {self.number}: validation"):
+            best, psnrs = self.validation.choose(states)
+            psnrs[AS_FINER] = self._as_finer(lambda finer: self.validation.viewer_psnrs(finer, self.validation.choosing)[0])
         report = self._report(states[best], curve, ended_by, best, psnrs)
         effects = {str(self.scene.request.viewer): self.scene.target}
         return Adapted(states[best], report, self.scene.backend, self.scene.target, effects, [kept] if kept else [], self.views, self.scene.views)
