@@ -718,6 +718,20 @@ def test_views_that_show_nothing_are_refused_and_leave_no_folder(job):
     assert not work_folder(job.target).exists()
 
 
+def test_validation_views_that_show_nothing_do_not_count(job, monkeypatch):
+    """As without tiles."""
+    around = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
+    views = tiny.cameras(5, seed=3, width=20, height=16)
+    away = [replace(view, viewmat=around @ view.viewmat) for view in views[:2]]
+    monkeypatch.setattr("mipmap_plugin.tiles.scene.split_validation", lambda cameras, chosen, *_: (chosen, [*away, *views[2:]]))
+    folder = work_folder(job.target)
+    folder.mkdir()
+    make_cut(job.base.checkpoint, 2, folder)
+    found = opened(job.base, job.scale, None, job.config(), folder).views
+    judged = torch.stack([view.viewmat for view in (*found.steering, *found.choosing)])
+    assert torch.equal(judged, torch.stack([views[number].viewmat for number in (2, 4, 3)]))
+
+
 def test_what_is_wrong_with_views_is_told(job, monkeypatch):
     monkeypatch.setattr("mipmap_plugin.adaptation.views.UNLIKE", 0.5)
     with pytest.warns(UserWarning, match="adapt with the cameras of each lens on their own"):
