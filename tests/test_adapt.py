@@ -227,6 +227,18 @@ def test_an_observer_may_interrupt_a_run(tmp_path):
     assert torch.equal(shown(resumed), shown(wrapped().adapt(1 / 4, **BRIEF)))
 
 
+def test_a_resumed_run_moves_no_coefficients_that_a_whole_one_leaves_alone(tmp_path, ctrl_c):
+    """View-dependent color that no viewer evaluates has no gradient, also after splats were dropped."""
+    base = wrap_model(VanillaModel.from_gaussians(tiny.with_bands(0, 1)), cameras=tiny.cameras(), backend="cpu")
+    whole = base.adapt(1 / 4, **BRIEF, returns="last")
+    ctrl_c(5)
+    with pytest.raises(Interrupted):
+        base.adapt(1 / 4, resume=tmp_path / "state", **BRIEF, returns="last")
+    resumed = base.adapt(1 / 4, resume=tmp_path / "state", **BRIEF, returns="last")
+    assert len(whole.model) < len(base.model)
+    assert all(torch.equal(tensor, resumed.model.parameters()[name]) for name, tensor in whole.model.parameters().items())
+
+
 @pytest.mark.parametrize("nth", [2, 5])  # before and after splats were cloned
 @pytest.mark.parametrize("views", [1, 2])  # two share an activation
 def test_a_resumed_paper_run_equals_an_uninterrupted_one(tmp_path, ctrl_c, nth, views):

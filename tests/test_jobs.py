@@ -597,6 +597,7 @@ def test_the_db_before_are_the_bases_and_of_no_other_state():
     told = {"the base as it is": 38.7, "the start": 21.9, "the last state": 25.0}
     assert summary._psnr({"validation": told, "returned": "the last state"}) == "38.70 -> 25.00"
     assert summary._psnr({"validation": {"the start": 21.9}, "returned": "the start"}) == ""
+    assert summary._psnr({"validation": told, "returned": "the last state", "written": 24.5}) == "38.70 -> 24.50"  # as its format rounds it
 
 
 def test_an_interruption_is_told_once(tmp_path):

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import pairwise
 
@@ -353,6 +354,8 @@ def test_a_ladder_from_end_to_end(tmp_path, small_chunks, capsys):
     assert [point["zoom"] for point in manifest["curve"]] == pytest.approx([near / point["pixel"] for point in manifest["curve"]])
     keyed = {zoom: psnr for level in manifest["levels"] for zoom, psnr in level["psnr_db"].items()}
     assert keyed == {f"{point['zoom']:.4g}": point["psnr_db"] for point in manifest["curve"]}
+    seconds = dict(ladder.levels[-1].report.seconds)
+    assert sum(seconds.values()) == pytest.approx(2 * seconds["total"])  # of all phases
     print_summary(folder, manifest)
     assert "3 levels by distance" in capsys.readouterr().out
 
@@ -385,6 +388,14 @@ def test_a_level_that_no_step_betters_is_not_merged_at_any_cost(small_chunks, mo
     assert told == name
     if name == AS_FINER:
         assert torch.equal(student.parameters()["means"], first.parameters()["means"])
+
+
+def test_what_takes_long_is_announced(small_chunks, monkeypatch):
+    told = []
+    for module in ("ladder", "level"):
+        monkeypatch.setattr(f"mipmap_plugin.levels.distance.{module}.announced", lambda what: (told.append(what), nullcontext())[1])
+    wrapped().levels("classic", by="distance", coarsest=1 / 2, ratio=2.0, **BRIEF)
+    assert told == ["level 1: choosing views", "level 1: merging", "level 1: validation", "measuring the levels"]
 
 
 def test_a_level_that_is_worse_than_the_finer_one_says_so(small_chunks, monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -13,6 +14,7 @@ import pytest
 import tiny
 import torch
 
+from mipmap_plugin.adaptation.optimization import loop
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.loop import adapt as real_adapt
 from mipmap_plugin.adaptation.report import AS_IT_IS
@@ -587,6 +589,21 @@ def test_the_result_does_not_depend_on_what_was_done_before(job, monkeypatch):
     assert read_ply(joined.file).columns["f_rest_0"].tobytes() == read_ply(undisturbed).columns["f_rest_0"].tobytes()
 
 
+def test_the_bar_of_a_tile_says_which_it_is_and_no_db(job, monkeypatch):
+    """Which it has not: it is measured as a part of the whole."""
+    told, began = [], loop.Bar.__init__
+    monkeypatch.setattr(loop.Bar, "__init__", lambda bar, **options: (told.append(options["desc"]), began(bar, **options))[1])
+    monkeypatch.setattr(loop.Bar, "set_postfix_str", lambda bar, text: told.append(text))
+    monkeypatch.setattr(run, "announced", lambda what: (told.append(what), nullcontext())[1])
+    adapt_in_tiles(replace(job, settings=job.settings | {"closed_form": False, "steps": 2}), 2)
+    assert set(told) == {"cutting", "adapting tile 1 x0.5", "adapting tile 2 x0.5", "40 splats", "measuring the whole", "writing out.ply"}
+
+
+def test_no_tile_grows_beyond_what_the_settings_allow(job):
+    settings = dict(steps=8, prune_every=2, densify_gradient=1e-9, most_growth=1.2, views="given", validation_views=2)
+    assert 80 < adapt_in_tiles(replace(job, recipe="paper", settings=settings), 2).report.gaussians_after <= 96
+
+
 def test_an_interrupted_tile_is_resumed(job, monkeypatch):
     def interrupt_early(run, task, config, on_interrupt, observe):
         return real_adapt(run, task, config, on_interrupt, lambda run: on_interrupt(run) if run.step == 2 else observe(run))
@@ -689,6 +706,36 @@ def test_a_damaged_plan_is_said_in_a_sentence(job):
     (work_folder(job.target) / "plan.json").write_text("")
     with pytest.raises(SceneError, match=r"plan\.json: is not JSON"):
         adapt_in_tiles(job, 2)
+
+
+def test_views_that_show_nothing_are_refused_and_leave_no_folder(job):
+    """The corrected command is another request, which a folder of this one would refuse."""
+    around = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
+    views = [replace(view, viewmat=around @ view.viewmat) for view in tiny.cameras(3, width=20, height=16)]
+    folder = tiny.folder(job.base.checkpoint.with_name("other"), views)
+    with pytest.raises(SettingsError, match="none of the 3 views shows a splat: the cameras seem to be of another scene"):
+        adapt_in_tiles(replace(job, base=replace(job.base, cameras=folder / "cameras.json")), 2)
+    assert not work_folder(job.target).exists()
+
+
+def test_validation_views_that_show_nothing_do_not_count(job, monkeypatch):
+    """As without tiles."""
+    around = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
+    views = tiny.cameras(5, seed=3, width=20, height=16)
+    away = [replace(view, viewmat=around @ view.viewmat) for view in views[:2]]
+    monkeypatch.setattr("mipmap_plugin.tiles.scene.split_validation", lambda cameras, chosen, *_: (chosen, [*away, *views[2:]]))
+    folder = work_folder(job.target)
+    folder.mkdir()
+    make_cut(job.base.checkpoint, 2, folder)
+    found = opened(job.base, job.scale, None, job.config(), folder).views
+    judged = torch.stack([view.viewmat for view in (*found.steering, *found.choosing)])
+    assert torch.equal(judged, torch.stack([views[number].viewmat for number in (2, 4, 3)]))
+
+
+def test_what_is_wrong_with_views_is_told(job, monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.adaptation.views.UNLIKE", 0.5)
+    with pytest.warns(UserWarning, match="adapt with the cameras of each lens on their own"):
+        adapt_in_tiles(replace(job, settings=job.settings | {"steps": 0}), 2)
 
 
 def test_an_output_is_not_replaced_unasked(job):

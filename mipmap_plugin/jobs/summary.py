@@ -33,11 +33,12 @@ def _row(outcome: Outcome) -> tuple[str, ...]:
 
 
 def _psnr(report: dict[str, Any]) -> str:
-    """dB before (the base as it is) and after, on views that nothing was adapted to; empty where one of them was not measured."""
+    """dB before (the base as it is) and after (the file, as its format rounds it), as in `Report.gain`; empty where one was not measured."""
     from mipmap_plugin.adaptation.report import AS_IT_IS  # which imports torch
 
-    psnrs = report.get("validation") or {}
-    after = next((psnr for name, psnr in psnrs.items() if str(report.get("returned", "")).startswith(name)), None)
+    psnrs, after = report.get("validation") or {}, report.get("written")
+    if after is None:
+        after = next((psnr for name, psnr in psnrs.items() if str(report.get("returned", "")).startswith(name)), None)
     before = psnrs.get(AS_IT_IS)
     return "" if before is None or after is None else f"{before:.2f} -> {after:.2f}"
 

@@ -25,7 +25,7 @@ from mipmap_plugin.tiles.reading import find_splats, make_cut
 PLAN = "plan.json"
 
 # Of the folder's files: those of another format are not gone on with.
-FORMAT = 4
+FORMAT = 5
 
 
 def refuse(job: Job, tiles: int) -> None:

@@ -6,13 +6,16 @@ import shutil
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report
-from mipmap_plugin.errors import JobsFailed
+from mipmap_plugin.adaptation.views import refuse_blind, remarks, too_unlike
+from mipmap_plugin.adaptation.warn import warn
+from mipmap_plugin.errors import JobsFailed, SettingsError
 from mipmap_plugin.formats.atomic import new_file, together, write_json
 from mipmap_plugin.formats.ply_rows import concatenate
 from mipmap_plugin.formats.tags import with_tags
@@ -32,7 +35,7 @@ from mipmap_plugin.tiles.report import make_report
 from mipmap_plugin.tiles.scene import TiledScene, close_opened, opened
 from mipmap_plugin.tiles.steering import Steered, open_state, result, sweep_of
 from mipmap_plugin.tiles.sweeps import Sweep
-from mipmap_plugin.tiles.truth import parts
+from mipmap_plugin.tiles.truth import draw_base, parts
 
 # Does jobs, and yields the outcome of each: an engine of `mipmap_plugin.jobs`.
 Engine = Callable[[Sequence[Job]], Generator[Outcome, None, None]]
@@ -73,6 +76,7 @@ def adapt_all_in_tiles(jobs: Sequence[Job], tiles: int, engine: Engine = in_this
     return_freed_memory()
     for job in jobs:
         _opened(job).wrapped.refuse_output(job.target, overwrite=job.overwrite, networks_move=False, viewer=job.viewer)
+    _examine_views(jobs)
     for number, job in enumerate(jobs):
         stages = _Stages(job, tuple(jobs[number + 1 :]), engine, {"cutting": time.perf_counter() - began})
         yield _adapted_and_saved(_opened(job), stages, began, threads)
@@ -83,17 +87,34 @@ def _opened(job: Job) -> TiledScene:
     return opened(job.base, job.scale, job.viewer, job.config(), work_folder(job.target))
 
 
+def _examine_views(jobs: Sequence[Job]) -> None:
+    """Warn of what is wrong with views, as without tiles, but by a sample of the splats. Raises SettingsError for views that show nothing."""
+    for scene in map(_opened, jobs):
+        model, views, near = scene.wrapped.model, scene.views.adapted, scene.base_effects.near_plane
+        try:
+            refuse_blind(views, model, near, partial(draw_base, scene), scene.scale)
+        except SettingsError:
+            close_opened()
+            for job in jobs:
+                shutil.rmtree(work_folder(job.target))  # nothing was done yet, and other cameras need another one
+            raise
+        orbit = not scene.wrapped.cameras or scene.config.views == "orbit"
+        for remark in filter(None, [*remarks(views, model, near, orbit=orbit), too_unlike(views)]):
+            warn(remark)
+
+
 def _adapted_and_saved(scene: TiledScene, stages: _Stages, began: float, threads: int | None) -> Joined:
     """Adapt a scene that is cut, and write it. `began`: when its time began to count."""
     facts = _adapted(scene, stages)
     last = time.perf_counter()
-    with thread_pool.limited_for(scene.backend, threads):
+    with announced("measuring the whole"), thread_pool.limited_for(scene.backend, threads):
         validation, returned = judged(scene)
     stages.seconds["validation"] = time.perf_counter() - last
     stages.seconds["total"] = time.perf_counter() - began
-    files = _write_parts(scene, returned)
-    report = make_report(scene, files, stages.seconds, validation, returned)
-    saved = _save(scene, stages.job, files, Joined(stages.job.target, report, facts))
+    with announced(f"writing {stages.job.target.name}"):
+        files = _write_parts(scene, returned)
+        report = make_report(scene, files, stages.seconds, validation, returned)
+        saved = _save(scene, stages.job, files, Joined(stages.job.target, report, facts))
     close_opened()
     shutil.rmtree(scene.folder)
     return saved

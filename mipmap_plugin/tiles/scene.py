@@ -17,7 +17,7 @@ from mipmap_plugin.adaptation.optimization.validation import split_validation
 from mipmap_plugin.adaptation.seeing import seeing
 from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.viewpoints import Viewpoints, orbit_of
-from mipmap_plugin.adaptation.views import choose_views, orbited
+from mipmap_plugin.adaptation.views import choose_views, orbited, showing
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.camera import Camera
@@ -114,6 +114,8 @@ class TiledScene:
         chosen, note = choose_views(cameras, self.viewpoints, self.config)
         adapted, validation = split_validation(cameras, chosen, self.viewpoints, self.scale, self.config)
         note += f", {len(chosen) - len(adapted)} of them kept for validation" if len(adapted) < len(chosen) else ""
+        shown = showing(validation, self.base.places[:, :3], self.base_effects.near_plane)
+        validation = shown if len(shown) > 1 else validation  # others are the same in every state
         named = [replace(view, name=str(number)) for number, view in enumerate([*adapted, *validation])]
         judged = named[len(adapted) :]
         return Views(named[: len(adapted)], judged[::2], judged[1::2], note)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.adaptation.optimization.validation import Steering, no_validation
 from mipmap_plugin.formats.torch_file import load_torch
-from mipmap_plugin.tiles.folder import run_file, tile_file
+from mipmap_plugin.tiles.folder import run_file, start_file, tile_file
 from mipmap_plugin.tiles.scene import TiledScene
 from mipmap_plugin.tiles.steering import Steered
 from mipmap_plugin.tiles.store import Store, write_store
@@ -87,7 +88,12 @@ class Tile:
         views = [crop or nothing(view.zoomed(self.scene.scale)) for view, crop in zip(self.scene.views.adapted, self.crops, strict=True)]
         white = self.scene.target.background == (1.0, 1.0, 1.0)
         validation = no_validation(around.wanted, around.render)
-        return Task(views, 1.0, around.wanted, around.render, white, validation, render_views=around.render_views, render_to_step=around.to_step)
+        start, growth = start_file(self.scene.folder, self.number), self.config.most_growth
+        most = sys.maxsize if growth is None else int(growth * len(Store(start)))
+        return Task(
+            views, 1.0, around.wanted, around.render, white, validation, max_splats=most, render_views=around.render_views,
+            render_to_step=around.to_step, part=f"tile {self.number + 1} x{self.scene.scale:g}",
+        )  # fmt: skip
 
     def _fingerprint(self) -> str:
         """A hash of everything that the run depends on."""

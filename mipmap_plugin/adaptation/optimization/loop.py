@@ -48,7 +48,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     run.costs.motion = lambda: task.follow.seconds
     forecast = Forecast(order, config, checks, Evaluations(task.follow, config, len(task.validation.steering)), run.step)
     began = run.watch.seconds - run.costs.seconds()
-    bar = Bar(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step", bar_format=BAR)
+    bar = Bar(total=config.steps, initial=run.step, disable=None, desc=f"adapting {task.part or f'x{task.scale:g}'}", unit="step", bar_format=BAR)
     with bar, ticking(bar), interruptible() as interrupted:
         reason = End.OBSERVER if observe(run) else run.reason_to_stop(config)
         while reason is None and run.step < config.steps:
@@ -63,7 +63,8 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
             bar.seconds_left = min(left, _budget_left(run, config))
             bar.update()
             if run.curve[-1].step == run.step:
-                bar.set_postfix_str(f"{run.curve[-1].validation_db:.2f} dB, {run.curve[-1].gaussians} splats")
+                quality = f"{run.curve[-1].validation_db:.2f} dB, " if task.validation.steering else ""
+                bar.set_postfix_str(f"{quality}{run.curve[-1].gaussians} splats")
             reason = End.OBSERVER if observe(run) else run.reason_to_stop(config) or _no_time_for_truths(run, config, order)
             if interrupted():
                 on_interrupt(run)

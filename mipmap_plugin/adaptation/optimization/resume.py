@@ -157,11 +157,13 @@ def load_run(state: dict[str, Any], student: SplatModel, config: AdaptConfig) ->
     for name, kind in kinds.items():
         if not isinstance(state[name], kind):
             raise TypeError(f"{name} must be of type {kind.__name__}")
-    device = student.parameters()["means"].device
+    device, still = student.parameters()["means"].device, [name for name, tensor in student.parameters().items() if not tensor.requires_grad]
     # A GPU sums blend weights in any order, so that merging again may leave another number of splats.
     if state["rows_changed"] or state["parameters"]["means"].shape != student.parameters()["means"].shape:
         rows = neighbors({name: tensor.to(device) for name, tensor in state["parameters"].items()})
         student.replace_parameters({name: tensor.requires_grad_() for name, tensor in rows.items()})
+        for name in still:  # as in an uninterrupted run, whose steps are others with a gradient more
+            student.parameters()[name].requires_grad_(False)
     else:  # the rows are those that the run began with, so that the model's other data by row still match them
         with torch.no_grad():
             for name, tensor in student.parameters().items():

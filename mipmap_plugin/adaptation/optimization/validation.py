@@ -205,7 +205,8 @@ def _validation_views(
         changes = {"views": "orbit", "extra_views": count, "seed": config.seed + SEED_OFFSET}
         validation, _ = choose_views(cameras, viewpoints, config.model_copy(update=changes))
         return list(views), validation
-    originals = [view for view in views if view in set(cameras)]
+    given = set(cameras)
+    originals = [view for view in views if view in given]
     kept: list[Camera] = []
     if config.views in ("train", "jittered"):
         kept = evenly(originals[VALIDATION_EVERY // 2 :], min(count // 2, len(originals) // VALIDATION_EVERY))

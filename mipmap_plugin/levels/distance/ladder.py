@@ -47,7 +47,8 @@ def make_levels_by_distance(base: FrozenBase, request: LadderRequest, resume: st
     with threads.limited_for(scene.backend, base.threads):
         levels = [first]
         for number in range(1, scene.rule.count):
-            run = LevelRun(scene, number, [level.model for level in levels])
+            with announced(f"level {number}: choosing views"):
+                run = LevelRun(scene, number, [level.model for level in levels])
             levels.append(store.level(f"level_{number}", run.run))
         scene, levels, left_out = without_repeats(scene, levels)
         with announced("measuring the levels"):

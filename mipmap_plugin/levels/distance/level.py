@@ -123,17 +123,19 @@ class LevelRun:
             student, name = self._start()
         initial, curve, ended_by, kept = student.copy(), [], "0 steps", None
         states = {f"the start, {name}": initial}
-        self.seconds["total"] = now(self.finest.means.device) - began
+        self.seconds["start"] = self.seconds["total"] = now(self.finest.means.device) - began
         if self.config.steps:
-            task = WalkTask(self.views, 1.0, self.truth, self._render, False, self.validation, size=self.size)
+            task = WalkTask(self.views, 1.0, self.truth, self._render, False, self.validation, part=f"level {self.number}", size=self.size)
             keeper = StateKeeper(resume, self._fingerprint())
             run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
             ended_by = adapt(run, task, self.config, keeper.save_and_stop, keeper.save_if_due).told(self.config, run.step)
             states |= run.states(initial)
+            self.seconds["pseudo truth"], self.seconds["validation"] = run.costs.sums()
+            self.seconds["optimization"] = run.watch.seconds - self.seconds["total"] - run.costs.seconds()
             curve, kept, self.seconds["total"] = run.curve, keeper.remaining_file(), run.watch.seconds
-            self.seconds["optimization"] = run.watch.seconds - run.costs.seconds()
-        best, psnrs = self.validation.choose(states)
-        psnrs[AS_FINER] = self._as_finer(lambda finer: self.validation.viewer_psnrs(finer, self.validation.choosing)[0])
+        with announced(f"level {self.number}: validation"):
+            best, psnrs = self.validation.choose(states)
+            psnrs[AS_FINER] = self._as_finer(lambda finer: self.validation.viewer_psnrs(finer, self.validation.choosing)[0])
         report = self._report(states[best], curve, ended_by, best, psnrs)
         effects = {str(self.scene.request.viewer): self.scene.target}
         return Adapted(states[best], report, self.scene.backend, self.scene.target, effects, [kept] if kept else [], self.views, self.scene.views)
