@@ -4,6 +4,7 @@ import errno
 import gc
 import json
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -96,6 +97,17 @@ def test_inspect_says_what_a_checkpoint_is(run, model_folder):
     assert all(fact in out for fact in (*facts, "screen filter: on"))
     assert [line.split(":")[0] for line in out.splitlines()[:3]] == ["file", "family", "verdict"]
     assert f"\nverdict:      sound; next: mipmap-plugin adapt {model_folder} --scale 1/4\n" in out and out.count("family:") == 1
+
+
+def test_inspect_of_an_adapted_file_ends_with_a_command_that_runs(run, tmp_path):
+    """It is copied as it stands; --output is required."""
+    provenance = {"scale": 0.25, "viewer": None}
+    ply = load_model(tiny.ply(tmp_path / "a.ply", count=20)).save(tmp_path / "b c.ply", provenance=provenance)
+    cameras = tiny.folder(tmp_path / "scene", tiny.cameras(1))
+    verdict = re.search(r"verdict: +(.+)", run("inspect", ply, "--cameras", cameras, "--no-viewers")[1])[1]
+    told, _, command = verdict.partition("; next: ")
+    assert told.startswith("sound, adapted to x0.25, at which alone it looks right")
+    assert run(*shlex.split(command)[1:]) == (0, "1 picture in DIR, at x0.25, which the file was adapted for\n", "")
 
 
 def test_inspect_lists_the_effects_that_are_off_if_asked(run, model_folder):
