@@ -31,6 +31,7 @@ from mipmap_plugin.commands.types import read_scale
 from mipmap_plugin.evaluation import backends as backends_module
 from mipmap_plugin.evaluation import viewer_differences
 from mipmap_plugin.evaluation.measure import baselines
+from mipmap_plugin.evaluation.published import PUBLISHED
 from mipmap_plugin.formats.ply import read_ply, write_ply
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models import load_model
@@ -446,6 +447,14 @@ def test_evaluate_averages_several_scenes_and_prints_the_published_rows(run, mod
     assert "| one       | x0.25 | P3 " in out and "| mean of 2 | x0.25 | P3 " in out
     assert "published, mean over the 8 scenes of NeRF-Synthetic" in out and "Mipmap-GS (arXiv 2408.06286)" in out
     refused(run("evaluate", model_folder, "--images", *scenes, "--scale", "1/4"), "--images: give one for each checkpoint", "; got 2, for 1 of these")
+
+
+@pytest.mark.parametrize("dataset", ["nerf-synthetic", "mip-nerf-360"])
+def test_published_rows_that_do_not_exist_are_no_empty_table(run, model_folder, tmp_path, dataset):
+    scene = tiny.scene(tmp_path / "one")
+    out = run("evaluate", model_folder, "--images", scene, "--scale", "3/8", "--published", dataset, "--no-report")[1]
+    said = out.splitlines()[-1].partition("they are at ")[2].replace(" and", ",").split(", ")
+    assert {read_scale(scale) for scale in said} == {row.scale for row in PUBLISHED if row.dataset == dataset}
 
 
 def test_an_option_that_counts_once_is_not_given_twice(run, model_folder, tmp_path):
