@@ -396,6 +396,21 @@ def test_given_cameras_have_the_image_size_of_the_training(tmp_path, given):
     assert base.asked()["cameras"] == digest_of(views)
 
 
+@pytest.mark.parametrize("given", ["", "cameras.json"])
+def test_cameras_that_are_sent_keep_the_image_size_of_their_training(tmp_path, given):
+    folder, lone = tiny.folder(tmp_path / "base", tiny.cameras(3)), tiny.ply(tmp_path / "lone.ply")
+    (folder / "cfg_args").write_text("Namespace(sh_degree=1, resolution=2)")
+    job = Job(Base(lone, cameras=folder / given), tmp_path / "out.ply", 0.5)
+    sizes = []
+
+    def look(job):
+        sizes.extend(view.size for view in job.base.load().cameras)
+        return Outcome(job, "failed")
+
+    do_parcel(pack(job), look)
+    assert sizes == [(tiny.HEIGHT // 2, tiny.WIDTH // 2)] * 3
+
+
 def test_options_beside_an_exchange_format_are_not_of_its_training(tmp_path):
     """Loading it does not read them."""
     file = corpus.SAMPLES[".spz"].make(tmp_path / "base")
