@@ -2,7 +2,7 @@
 
     python examples/train_demo_scene.py demo_base --size 160
 
-writes a 3DGS model folder. It needs no data: the truth is ray-traced. With the `cpu` extra it takes about ten minutes on two cores.
+writes a 3DGS model folder. It needs no data: the truth is ray-traced. It takes about ten minutes on two cores.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ import errno
 import gc
 import json
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -30,6 +31,7 @@ from mipmap_plugin.commands.types import read_scale
 from mipmap_plugin.evaluation import backends as backends_module
 from mipmap_plugin.evaluation import viewer_differences
 from mipmap_plugin.evaluation.measure import baselines
+from mipmap_plugin.evaluation.published import PUBLISHED
 from mipmap_plugin.formats.ply import read_ply, write_ply
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models import load_model
@@ -96,6 +98,17 @@ def test_inspect_says_what_a_checkpoint_is(run, model_folder):
     assert all(fact in out for fact in (*facts, "screen filter: on"))
     assert [line.split(":")[0] for line in out.splitlines()[:3]] == ["file", "family", "verdict"]
     assert f"\nverdict:      sound; next: mipmap-plugin adapt {model_folder} --scale 1/4\n" in out and out.count("family:") == 1
+
+
+def test_inspect_of_an_adapted_file_ends_with_a_command_that_runs(run, tmp_path):
+    """It is copied as it stands; --output is required."""
+    provenance = {"scale": 0.25, "viewer": None}
+    ply = load_model(tiny.ply(tmp_path / "a.ply", count=20)).save(tmp_path / "b c.ply", provenance=provenance)
+    cameras = tiny.folder(tmp_path / "scene", tiny.cameras(1))
+    verdict = re.search(r"verdict: +(.+)", run("inspect", ply, "--cameras", cameras, "--no-viewers")[1])[1]
+    told, _, command = verdict.partition("; next: ")
+    assert told.startswith("sound, adapted to x0.25, at which alone it looks right")
+    assert run(*shlex.split(command)[1:]) == (0, "1 picture in DIR, at x0.25, which the file was adapted for\n", "")
 
 
 def test_inspect_lists_the_effects_that_are_off_if_asked(run, model_folder):
@@ -434,6 +447,14 @@ def test_evaluate_averages_several_scenes_and_prints_the_published_rows(run, mod
     assert "| one       | x0.25 | P3 " in out and "| mean of 2 | x0.25 | P3 " in out
     assert "published, mean over the 8 scenes of NeRF-Synthetic" in out and "Mipmap-GS (arXiv 2408.06286)" in out
     refused(run("evaluate", model_folder, "--images", *scenes, "--scale", "1/4"), "--images: give one for each checkpoint", "; got 2, for 1 of these")
+
+
+@pytest.mark.parametrize("dataset", ["nerf-synthetic", "mip-nerf-360"])
+def test_published_rows_that_do_not_exist_are_no_empty_table(run, model_folder, tmp_path, dataset):
+    scene = tiny.scene(tmp_path / "one")
+    out = run("evaluate", model_folder, "--images", scene, "--scale", "3/8", "--published", dataset, "--no-report")[1]
+    said = out.splitlines()[-1].partition("they are at ")[2].replace(" and", ",").split(", ")
+    assert {read_scale(scale) for scale in said} == {row.scale for row in PUBLISHED if row.dataset == dataset}
 
 
 def test_an_option_that_counts_once_is_not_given_twice(run, model_folder, tmp_path):

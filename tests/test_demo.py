@@ -6,6 +6,7 @@ from importlib.resources import files
 
 import pytest
 
+from mipmap_plugin.commands.demo import demo
 from mipmap_plugin.demo.run import PROTOCOL, WorldView, embedded, run_demo
 from mipmap_plugin.demo.story import story
 from mipmap_plugin.errors import OutputExists
@@ -31,6 +32,14 @@ def test_a_second_demo_does_not_overwrite_the_first(tmp_path):
     with pytest.raises(OutputExists, match="--overwrite"):
         run_demo(tmp_path, [0.25])
     assert (tmp_path / "x0.25.ply").read_text() == "mine"
+
+
+def test_a_scale_that_is_given_twice_is_adapted_to_once(monkeypatch):
+    """The second file would be in the way of the first, after all the work."""
+    asked = []
+    monkeypatch.setattr("mipmap_plugin.demo.run.run_demo", lambda output, scales, *rest, **options: asked.extend(scales) or "")
+    demo(scale=(0.25, 4.0, 0.25))
+    assert asked == [0.25, 4.0]
 
 
 def test_the_story_says_what_changed_at_each_zoom_and_where_it_is(tmp_path):

@@ -284,6 +284,7 @@ def test_a_folder_with_several_exchange_files_names_them(tmp_path):
         ("export/a.ply", "no file of splats, but export; give one file"),
         ("images/a.jpg", r"no file of splats, but photographs or what a scene is trained on \(that is for --images and --cameras\); give one file"),
         ("a.JPG", "no file of splats, but photographs"),
+        ("transforms_train.json", "no file of splats, but photographs or what a scene is trained on"),
         ("notes.txt", "no file of splats; give one file"),
     ],
 )

@@ -28,6 +28,7 @@ from mipmap_plugin.backends import BACKENDS
 from mipmap_plugin.commands.adapt import Changes
 from mipmap_plugin.commands.many import Many
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.effects import explain
 from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.formats.splat_transform import find_tool
 from mipmap_plugin.models.families import BUILT_IN
@@ -224,6 +225,12 @@ def test_recipes_viewers_and_settings_exist(page):
         assert set(re.findall(rf'(?:--{word} |\b{word}=")([a-z][\w-]*)', text)) <= set(registry.names())
     arguments = {*inspect.signature(Wrapped.adapt).parameters, *inspect.signature(wrap_model).parameters, *AdaptConfig.model_fields, "eval"}
     assert set(re.findall(r"`(\w+)=[^`]+`", text)) <= arguments
+
+
+def test_the_number_of_effects_is_that_of_inspect():
+    model = wrap_model(files("mipmap_plugin.demo").joinpath("base.ply"))
+    told = re.search(r"Of the (\d+), flowers", (ROOT / "docs/tradeoffs.md").read_text(encoding="utf-8"))
+    assert int(told[1]) == len(explain(model.effects(), model.model.gaussians(model.any_camera())))
 
 
 def test_scripts_that_are_named_exist():

@@ -169,7 +169,8 @@ def test_cameras_of_each_scene(run, tmp_path):
         ("a.ply b.ply --scale 4 --backend nobody", "there is no backend 'nobody'"),
         ("a.ply b.ply --scale 4 --shard 3", "--shard 3: give the part"),
         ("a.ply b.ply --scale 4 --shard 3/2", "--shard 3/2: there is no such part"),
-        ("a.ply b.ply --scale 4 --jobs 0", "must be at least 1"),
+        ("a.ply b.ply --scale 4 --jobs 0", "mipmap-plugin: --jobs must be at least 1, got 0\n"),
+        ("a.ply b.ply --scale 4 --threads 0", "mipmap-plugin: --threads must be at least 1, got 0\n"),
         ("a.ply b.ply --scale 4 --jobs 2 --dask local:2", "leave one of them out"),
         ("x/a.ply y/a.ply --scale 4 --output new", "would both be written to"),
         ("*.spz --scale 4", "no file or folder fits this pattern"),
@@ -393,6 +394,21 @@ def test_given_cameras_have_the_image_size_of_the_training(tmp_path, given):
     views = base.load().cameras
     assert {view.size for view in views} == {(tiny.HEIGHT // 2, tiny.WIDTH // 2)}
     assert base.asked()["cameras"] == digest_of(views)
+
+
+@pytest.mark.parametrize("given", ["", "cameras.json"])
+def test_cameras_that_are_sent_keep_the_image_size_of_their_training(tmp_path, given):
+    folder, lone = tiny.folder(tmp_path / "base", tiny.cameras(3)), tiny.ply(tmp_path / "lone.ply")
+    (folder / "cfg_args").write_text("Namespace(sh_degree=1, resolution=2)")
+    job = Job(Base(lone, cameras=folder / given), tmp_path / "out.ply", 0.5)
+    sizes = []
+
+    def look(job):
+        sizes.extend(view.size for view in job.base.load().cameras)
+        return Outcome(job, "failed")
+
+    do_parcel(pack(job), look)
+    assert sizes == [(tiny.HEIGHT // 2, tiny.WIDTH // 2)] * 3
 
 
 def test_options_beside_an_exchange_format_are_not_of_its_training(tmp_path):

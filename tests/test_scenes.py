@@ -351,6 +351,23 @@ def test_a_cameras_json_alone_says_what_it_lacks(tmp_path):
     assert "without cfg_args" in scene.notes[0]
 
 
+@pytest.mark.parametrize("given", ["", "cameras.json"])
+def test_cameras_of_a_model_folder_have_the_size_and_the_split_of_its_training(tmp_path, given):
+    """They are given with a lone file that was exported from it; the options of the checkpoint itself come first."""
+    write_json(tmp_path / "cameras.json", [entry(), entry(id=1, img_name="b")])
+    (tmp_path / "cfg_args").write_text("Namespace(resolution=2, eval=True)")
+    scene = load_scene(tmp_path / given)
+    assert [(camera.size, camera.split) for camera in scene.cameras] == [((24, 32), "test"), ((24, 32), "train")] and scene.notes == []
+    assert {camera.size for camera in load_scene(tmp_path / given, {"resolution": 4}).cameras} == {(12, 16)}
+
+
+def test_damaged_options_beside_cameras_are_named(tmp_path):
+    path = write_json(tmp_path / "cameras.json", [entry()])
+    (tmp_path / "cfg_args").write_text("Namespace(")
+    with pytest.raises(SceneError, match=r"cfg_args is not a plain .* mend it, or take it away"):
+        load_scene(path)
+
+
 def test_a_checkpoint_may_come_with_cameras_or_without(tmp_path):
     assert model_cameras(None) == model_cameras(tmp_path) == []
     write_json(tmp_path / "cameras.json", [entry()])

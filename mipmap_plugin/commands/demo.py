@@ -6,7 +6,7 @@ from pathlib import Path
 
 import tyro
 
-from mipmap_plugin.commands.types import Scale
+from mipmap_plugin.commands.types import Scale, unique_scales
 from mipmap_plugin.commands.voice import detail, say
 
 
@@ -28,4 +28,4 @@ def demo(
     """
     from mipmap_plugin.demo.run import run_demo
 
-    say(run_demo(output, scale or (0.125, 0.25, 4.0), viewer, report=report, overwrite=overwrite, detail=detail))
+    say(run_demo(output, unique_scales(scale or (0.125, 0.25, 4.0)), viewer, report=report, overwrite=overwrite, detail=detail))

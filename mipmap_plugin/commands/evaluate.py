@@ -142,7 +142,8 @@ class _Results:
         say("\n".join([title, table(self._rows), *self._notes]))
         if dataset:
             say(f"\npublished, {TITLE[dataset]}; rows of different protocols are not comparable")
-            say(published_table(published(dataset, self._scales)))
+            rows = published(dataset, self._scales)
+            say(published_table(rows) if rows else "there are none at these scales; they are at x1/2, x1/4, x1/8, x2, x4 and x8")
         if self._page:
             say(look_at(self._page))
 

@@ -113,17 +113,27 @@ def _verdict(wrapped: Wrapped, advice: str, health: Sequence[str], spoilt: bool,
         return "doubtful: read health before you adapt it"
     remarks = len(health)
     noted = f", but {unseen}" if unseen else f", with {remarks} remark{'s' if remarks > 1 else ''} (health)" if remarks else ""
-    return f"sound{noted}; next: {advice}"
+    scale = _adapted_to(wrapped)
+    made = "" if scale is None else f", adapted to x{scale:g}, at which alone it looks right"
+    return f"sound{made}{noted}; next: {advice}"
+
+
+def _adapted_to(wrapped: Wrapped) -> float | None:
+    """The scale that a checkpoint was adapted to, if that is another than its base's."""
+    from mipmap_plugin.models.adapted_scale import adapted_scale
+
+    scale = adapted_scale(wrapped.model.source)
+    return None if scale == 1 else scale
 
 
 def _advice(wrapped: Wrapped, checkpoint: Path, given: Path | None) -> str:
     """The next command for a sound checkpoint, with what this one was told. `given`: where its cameras lie."""
-    from mipmap_plugin.models.adapted_scale import adapted_scale
     from mipmap_plugin.scenes import unread_cameras
 
-    place, scale = shlex.quote(str(checkpoint)), adapted_scale(wrapped.model.source)
-    if scale not in (None, 1.0):
-        return f"mipmap-plugin render {place}, at x{scale:g}, which it was adapted to and looks right at"
+    if _adapted_to(wrapped) is not None:  # the scale that it is drawn at unless another is given
+        own = [] if given is None else ["--cameras", str(given)]
+        return shlex.join(["mipmap-plugin", "render", str(checkpoint), "--output", "DIR", *own])
+    place = shlex.quote(str(checkpoint))
     words = ["mipmap-plugin", "adapt", place, "--scale", "1/4"]
     if told := wrapped.asked["screen filter"]:
         words += ["--screen-filter", told]

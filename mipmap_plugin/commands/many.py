@@ -171,7 +171,7 @@ def engine(many: Many, jobs: Sequence[Job], threads: int | None) -> Generator[Ou
 
     count = 1 if many.jobs is None else many.jobs
     if count < 1 or (threads is not None and threads < 1):
-        raise SettingsError(f"--jobs and --threads must be at least 1, got {count} and {threads}")
+        raise SettingsError(f"--jobs must be at least 1, got {count}" if count < 1 else f"--threads must be at least 1, got {threads}")
     if many.dask is None:
         return in_this_process(jobs, threads) if count == 1 else in_workers(jobs, count, threads)
     if many.jobs is not None:

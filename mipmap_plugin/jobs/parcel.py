@@ -17,7 +17,7 @@ from mipmap_plugin.models import detect
 from mipmap_plugin.models.outputs import parts_of, refuse_parts
 from mipmap_plugin.models.places import conversion_state, state_path
 from mipmap_plugin.models.zipped_folder import opened
-from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.scenes import OPTIONS, load_scene
 
 # Folders of an unpacked parcel.
 BASE, CAMERAS, IMAGES, OUTPUT = Path("base"), Path("cameras"), Path("images"), Path("output")
@@ -118,11 +118,10 @@ def _write(archive: tarfile.TarFile, member: tarfile.TarInfo, place: Path, job: 
 
 
 def _scene(path: Path, folder: Path) -> dict[Path, Path]:
-    """The files of a scene, by their names in the archive: a file, a model folder's cameras, or the folder with its photographs."""
-    if path.is_file():
-        return {folder / path.name: path}
-    if (path / "cameras.json").is_file():
-        return {folder / "cameras.json": path / "cameras.json"}
+    """The files of a scene, by their names in the archive: a file, a model folder's cameras and options, or the folder with its photographs."""
+    file = path if path.is_file() else path / "cameras.json"
+    if file.is_file():
+        return {folder / each.name: each for each in (file, file.with_name(OPTIONS)) if each.is_file()}
     return {folder / file.relative_to(path): file for file in path.rglob("*") if file.is_file()}
 
 

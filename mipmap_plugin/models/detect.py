@@ -185,7 +185,7 @@ def _instead(folder: Path) -> str:
     meant = [entry for entry in entries if entry.is_dir() and any(entry.glob("*.ply"))]
     if meant:
         return f", but {', '.join(entry.name for entry in meant[:5])}{', ...' * (len(meant) > 5)}"
-    if any(entry.suffix.lower() in PHOTOGRAPHS or entry.name in ("images", "sparse") for entry in entries):
+    if any(entry.suffix.lower() in PHOTOGRAPHS or entry.name in ("images", "sparse") or entry.match("transforms*.json") for entry in entries):
         return ", but photographs or what a scene is trained on (that is for --images and --cameras)"
     return ""
 

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import SceneError
+from mipmap_plugin.errors import CheckpointError, SceneError
+from mipmap_plugin.formats.cfg_args import read_cfg_args
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.scenes.base import Scene
@@ -17,6 +18,9 @@ from mipmap_plugin.scenes.moving import is_dynerf, is_hypernerf, read_dynerf, re
 from mipmap_plugin.scenes.orbits import orbit
 from mipmap_plugin.scenes.trajectories import jittered
 from mipmap_plugin.scenes.transforms import read_transforms
+
+# What a cameras.json was written with, beside it.
+OPTIONS = "cfg_args"
 
 # The names of the files of a COLMAP model.
 COLMAP_FILES = {f"{name}{suffix}" for name in ("cameras", "images", "points3D", "frames", "rigs") for suffix in (".bin", ".txt")}
@@ -32,8 +36,9 @@ def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     scene, one of DyNeRF or HyperNeRF as 4DGaussians reads them, or a PLY that has a camera in it (`cameras_in`).
 
     `cfg` is the checkpoint's cfg_args, which determine the test split and training size (`read_cameras`, `read_colmap`, `read_transforms`), and
-    the frame of HyperNeRF's captures: Deformable 3D Gaussians moves and scales them. A folder
-    with both COLMAP's `sparse` and transforms files is read from `sparse`, as graphdeco-inria does.
+    the frame of HyperNeRF's captures, which Deformable 3D Gaussians moves and scales; without it (a lone file, exported from a model folder) a
+    cameras.json is read with the cfg_args beside it. A folder with both COLMAP's `sparse` and transforms files is read from `sparse`, as
+    graphdeco-inria does.
     Raises SceneError.
     """
     path = path_of(path)
@@ -100,5 +105,10 @@ def _holds_cameras(path: Path) -> bool:
 
 
 def _cameras_only(file: Path, source: Path, cfg: dict[str, Any] | None) -> Scene:
+    if not cfg and (beside := file.with_name(OPTIONS)).is_file():
+        try:
+            cfg = read_cfg_args(beside)
+        except CheckpointError as error:
+            raise SceneError(f"{error}; without it the size of the cameras in {file} is not known: mend it, or take it away") from error
     notes = [] if cfg else [f"{file.name} was read without cfg_args: all cameras count as training views, at the size that the file states"]
     return Scene(tuple(read_cameras(file, cfg)), {}, source, notes)
