@@ -54,11 +54,11 @@ def test_psnr_is_the_mean_square_in_decibel_after_clamping():
 
 
 def gaussian_window_ssim(image, truth):
-    """Wang et al. 2004 by hand: an 11 x 11 Gaussian window of sigma 1.5, only where it fits into the image."""
+    """Wang et al. 2004 by hand: an 11 x 11 Gaussian window of sigma 1.5 around each pixel, with black around the image, as in the papers' code."""
     offsets = torch.arange(11, dtype=torch.float64) - 5
     line = (-(offsets**2) / (2 * 1.5**2)).exp()
     window = (line[:, None] * line / line.sum() ** 2)[None, None]
-    blur = lambda planes: torch.nn.functional.conv2d(planes, window)  # noqa: E731
+    blur = lambda planes: torch.nn.functional.conv2d(planes, window, padding=5)  # noqa: E731
     x, y = (each.double().movedim(-1, 0)[:, None] for each in (image, truth))
     mx, my = blur(x), blur(y)
     vx, vy, vxy = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
