@@ -22,9 +22,10 @@ from mipmap_plugin.wrap import Wrapped
 def evaluation_page(title: str, galleries: Sequence[Gallery], rows: Sequence[Row], **further: Any) -> Page:
     """The page of rows and of the galleries that watched them; `further`: commands and notes."""
     adaptations = [each for gallery in galleries for each in gallery.adaptations]
-    zooms = [zoom for gallery in galleries for zoom in gallery.zooms(rows, named=len(galleries) > 1)]
+    each_with_rows = [(zoom, gallery.own(rows)) for gallery in galleries for zoom in gallery.zooms(rows, named=len(galleries) > 1)]
+    zooms = [zoom for zoom, _ in each_with_rows]
     effects = adaptations[0]["effects"] if adaptations else galleries[0].effects()
-    lead = " ".join(filter(None, (_lead(zoom, rows) for zoom in zooms)))
+    lead = " ".join(filter(None, (_lead(zoom, own) for zoom, own in each_with_rows)))
     return Page(title, lead, zooms=zooms, rows=records(rows), adaptations=adaptations, effects=effects, provenance=versions(), **further)
 
 
