@@ -310,6 +310,24 @@ def test_ctrl_c_ends_with_130_and_the_same_command_goes_on(run, model_folder, tm
     assert not (tmp_path / "new.ply.resume").exists()
 
 
+def test_ctrl_c_between_two_files_and_the_same_command_goes_on(run, model_folder, tmp_path, monkeypatch):
+    """What is finished is not made again; the page says of it what it can."""
+    command = ["adapt", model_folder, "--scale", "1/4", "--scale", "1/2", *QUICK]
+    whole = json.loads(run(*command, "--output", tmp_path / "whole", "--json")[1])
+    pressing.in_step(monkeypatch, lambda: signal.raise_signal(signal.SIGINT))(3)
+    command += ["--output", tmp_path / "new", "--report"]
+    code, _, err = run(*command)
+    assert code == 130 and "run the same command again to continue from" in err
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["base_x0.25", "base_x0.5.resume"]
+    code, out, err = run(*command, "--json")
+    again = json.loads(out)
+    assert (code, err) == (0, "") and [report["scale"] for report in again] == [0.25, 0.5]
+    assert [splats_of(report) for report in again] == [splats_of(report) for report in whole]
+    record = record_of(tmp_path / "new" / "base_adapted.report.html")
+    assert [report["title"] for report in record["adaptations"]] == ["×1/4", "×1/2"] and [zoom["label"] for zoom in record["zooms"]] == ["×1/2"]
+    assert record["notes"][0] == "×1/4: it was finished before an interruption, after which its pictures are not drawn again"
+
+
 def test_adapt_to_the_bases_own_scale_gives_the_base(run, model_folder, tmp_path):
     code, out, err = run("adapt", model_folder, "--scale", "1", "--output", tmp_path / "same.ply", "--report")
     assert (code, err) == (0, "") and out.startswith("x1: holds the base as it is, 60 -> 60 splats, 0.0 s\n")
