@@ -156,6 +156,12 @@ def test_the_adapted_model_is_drawn_with_every_setting_of_a_renderer(points):
     assert drawn["alpha from 1/16"].psnr_db.median != pytest.approx(usual, abs=1e-3)
 
 
+def test_the_base_enlarged_is_not_compared_with_itself():
+    """It would be the truth, enlarged and shrunk again."""
+    model = wrapped()
+    assert not any(each.name.startswith("base, resized") for each in measuring._baselines(model, base_itself(model, 2, 1), 2, PLAN))
+
+
 def test_the_base_resized_stands_beside_photographs(tmp_path):
     model, scene = wrapped(), load_scene(tiny.scene(tmp_path / "scene"))
     yardstick = photographs(model, scene, 1 / 4, 1)

@@ -151,7 +151,7 @@ def _baselines(model: Wrapped, truth: GroundTruth, scale: float, plan: Plan) -> 
     """All baselines, except the one that is the truth itself."""
     found = baselines(model, scale, truth.shrink_by, filters=_filters(model), samples=plan.supersampling)
     found += [base_in_viewer(plan.viewer, model, scale)] if plan.viewer else []
-    return [baseline for baseline in found if not (truth.is_resized_base and baseline.name == RESIZED)]
+    return [baseline for baseline in found if not (truth.is_base and baseline.name == RESIZED)]
 
 
 def _filters(model: Wrapped) -> list[str]:
