@@ -84,6 +84,16 @@ def refused_once_named(answer, *words):
     return refused((code, "", err), *words)
 
 
+def record_of(page):
+    """The JSON within a page."""
+    return json.loads(re.search(r'<script type="application/json" id="record">(.*?)</script>', page.read_text(), re.DOTALL)[1])
+
+
+def splats_of(report):
+    """The bytes of the splats of an adapted PLY, whose header has the seconds of the run."""
+    return Path(report["file"]).read_bytes().partition(b"end_header\n")[2]
+
+
 # inspect
 
 
@@ -300,6 +310,24 @@ def test_ctrl_c_ends_with_130_and_the_same_command_goes_on(run, model_folder, tm
     assert not (tmp_path / "new.ply.resume").exists()
 
 
+def test_ctrl_c_between_two_files_and_the_same_command_goes_on(run, model_folder, tmp_path, monkeypatch):
+    """What is finished is not made again; the page says of it what it can."""
+    command = ["adapt", model_folder, "--scale", "1/4", "--scale", "1/2", *QUICK]
+    whole = json.loads(run(*command, "--output", tmp_path / "whole", "--json")[1])
+    pressing.in_step(monkeypatch, lambda: signal.raise_signal(signal.SIGINT))(3)
+    command += ["--output", tmp_path / "new", "--report"]
+    code, _, err = run(*command)
+    assert code == 130 and "run the same command again to continue from" in err
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["base_x0.25", "base_x0.5.resume"]
+    code, out, err = run(*command, "--json")
+    again = json.loads(out)
+    assert (code, err) == (0, "") and [report["scale"] for report in again] == [0.25, 0.5]
+    assert [splats_of(report) for report in again] == [splats_of(report) for report in whole]
+    record = record_of(tmp_path / "new" / "base_adapted.report.html")
+    assert [report["title"] for report in record["adaptations"]] == ["×1/4", "×1/2"] and [zoom["label"] for zoom in record["zooms"]] == ["×1/2"]
+    assert record["notes"][0] == "×1/4: it was finished before an interruption, after which its pictures are not drawn again"
+
+
 def test_adapt_to_the_bases_own_scale_gives_the_base(run, model_folder, tmp_path):
     code, out, err = run("adapt", model_folder, "--scale", "1", "--output", tmp_path / "same.ply", "--report")
     assert (code, err) == (0, "") and out.startswith("x1: holds the base as it is, 60 -> 60 splats, 0.0 s\n")
@@ -445,8 +473,19 @@ def test_evaluate_averages_several_scenes_and_prints_the_published_rows(run, mod
     code, out, _ = run("evaluate", model_folder, model_folder, "--images", *scenes, *words)
     assert code == 0
     assert "| one       | x0.25 | P3 " in out and "| mean of 2 | x0.25 | P3 " in out
-    assert "published, mean over the 8 scenes of NeRF-Synthetic" in out and "Mipmap-GS (arXiv 2408.06286)" in out
+    trained = "trained at 800 px for zoom-out and at 100 px for zoom-in; rows of other protocols, and of bases trained at another size"
+    assert f"published, mean over the 8 scenes of NeRF-Synthetic, {trained}, are not comparable" in out and "Mipmap-GS (arXiv 2408.06286)" in out
     refused(run("evaluate", model_folder, "--images", *scenes, "--scale", "1/4"), "--images: give one for each checkpoint", "; got 2, for 1 of these")
+
+
+def test_checkpoints_of_one_scene_are_told_apart_and_not_averaged(run, model_folder, tmp_path):
+    scene, other = tiny.scene(tmp_path / "scene"), tiny.folder(tmp_path / "other", tiny.cameras(3) + tiny.cameras(1, seed=9, split="test"), seed=1)
+    answer = run("evaluate", model_folder, other, "--images", scene, scene, "--scale", "1/2", "--output", tmp_path / "rows.json")
+    rows = json.loads((tmp_path / "rows.json").read_text())["rows"]
+    bases = {row["scene"]: row["psnr_db"] for row in rows if row["name"] == "base"}
+    assert answer[0] == 0 and list(bases) == [f"scene, {model_folder}", f"scene, {other}"]
+    pictures = [zoom["pictures"] for zoom in record_of(tmp_path / "rows.html")["zooms"]]
+    assert [each["mean"]["psnr_db"] for zoom in pictures for each in zoom if each["name"] == "base"] == [*bases.values()]
 
 
 @pytest.mark.parametrize("dataset", ["nerf-synthetic", "mip-nerf-360"])

@@ -13,7 +13,7 @@ from PIL import Image
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation import measure, photographs, protocols
-from mipmap_plugin.evaluation.evaluate import Evaluator, evaluate, means, training_free_rows
+from mipmap_plugin.evaluation.evaluate import Evaluator, Row, evaluate, means, training_free_rows
 from mipmap_plugin.evaluation.metrics import SAME_DB, psnr, ssim
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.evaluation.published import PUBLISHED, published
@@ -54,11 +54,11 @@ def test_psnr_is_the_mean_square_in_decibel_after_clamping():
 
 
 def gaussian_window_ssim(image, truth):
-    """Wang et al. 2004 by hand: an 11 x 11 Gaussian window of sigma 1.5, only where it fits into the image."""
+    """Wang et al. 2004 by hand: an 11 x 11 Gaussian window of sigma 1.5 around each pixel, with black around the image, as in the papers' code."""
     offsets = torch.arange(11, dtype=torch.float64) - 5
     line = (-(offsets**2) / (2 * 1.5**2)).exp()
     window = (line[:, None] * line / line.sum() ** 2)[None, None]
-    blur = lambda planes: torch.nn.functional.conv2d(planes, window)  # noqa: E731
+    blur = lambda planes: torch.nn.functional.conv2d(planes, window, padding=5)  # noqa: E731
     x, y = (each.double().movedim(-1, 0)[:, None] for each in (image, truth))
     mx, my = blur(x), blur(y)
     vx, vy, vxy = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
@@ -283,6 +283,11 @@ def test_the_mean_over_scenes(model, scene):
         assert mean.psnr_db == pytest.approx(row.psnr_db + 1) and mean.ssim is None
         assert mean.adapted_on == row.adapted_on
     assert table([*rows, *averaged]).splitlines()[0].startswith("| scene ")
+
+
+def test_the_mean_over_scenes_whose_worst_viewers_differ():
+    rows = [Row(f"base in {viewer}, worst of 2", 1 / 2, "P3", psnr, None, 0.0, 1.0, 9) for viewer, psnr in (("spark", 20.0), ("classic", 30.0))]
+    assert [(row.name, row.psnr_db, row.scene) for row in means(rows)] == [("base, worst of 2 viewers", 25.0, "mean of 2")]
 
 
 def test_a_checkpoint_without_cameras_cannot_be_judged(scene):

@@ -1,6 +1,7 @@
 """What the examples bring, as a package would that is installed beside this one: by entry points alone, in the commands."""
 
 import runpy
+from functools import partialmethod
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import tiny
 
 from mipmap_plugin import cli, load_model, registry, wrap_model
 from mipmap_plugin.scenes import write_cameras
+from mipmap_plugin.wrap import Wrapped
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
@@ -70,6 +72,15 @@ def test_a_file_for_the_viewer_of_the_example(scene, tmp_path, capsys):
     assert cli.main(["adapt", *scene, "--scale", "1/2", "--steps", "1", "--viewer", "kiosk", "--output", str(tmp_path / "out.ply")]) == 0
     assert "x0.5 in kiosk" in capsys.readouterr().out
     assert b'"viewer": "kiosk"' in (tmp_path / "out.ply").read_bytes()[:8192]
+
+
+@pytest.mark.parametrize(("name", "made"), [("base/", "base_x0.5/point_cloud/iteration_30000/point_cloud.ply"), ("base.ply", "base_x0.5.ply")])
+def test_the_adapted_checkpoint_lies_beside_its_base(tmp_path, monkeypatch, name, made):
+    monkeypatch.chdir(tmp_path)
+    tiny.model().save(tmp_path / name, provenance={})
+    monkeypatch.setattr(Wrapped, "adapt", partialmethod(Wrapped.adapt, steps=1))
+    runpy.run_path(str(EXAMPLES / "adapt_checkpoint.py"))["main"](name, 0.5)
+    assert (tmp_path / made).is_file() and (tmp_path / "after.png").is_file()
 
 
 def test_the_demo_scene_can_be_trained(tmp_path):

@@ -194,6 +194,23 @@ def test_the_page_tells_of_the_default_recipe_by_name_in_whatever_order_recipes_
     assert [picture.name for picture in page.zooms[0].pictures] == ["base", "default, held out", "instant, held out", "truth", "default, scored"]
 
 
+def test_each_scene_of_a_page_has_its_own_seconds():
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(3))
+    image, galleries, rows = torch.zeros(8, 8, 3), [], list[Row]()
+    for scene, seconds in (("ball", 3.0), ("cube", 7.0)):
+        galleries.append(Gallery(base, "itself"))
+        galleries[-1].restored("instant, held out", {"scale": 1 / 2, "effects": []})
+        for name in ("base", "instant, held out"):
+            galleries[-1].shot(Shot(name, scene, 1 / 2, base.cameras[0], image, image, 20.0, None, None))
+            rows.append(Row(name, 1 / 2, "P3", 20.0, None, seconds, 1.0, 9, scene=scene))
+    lead = evaluation_page("both", galleries, rows, commands=()).lead
+    assert [part.split(" in ")[1] for part in lead.split("s.") if part] == ["3.0 ", "7.0 "]
+
+
+def test_the_table_of_a_page_says_which_lpips_it_has():
+    assert "lpips_label" in files("mipmap_plugin.pages").joinpath("sections.js").read_text()
+
+
 def test_a_recipe_at_two_scales_is_adapted_at_both(model_folder):
     gallery = Gallery(wrap_model(model_folder), "itself")
     image = torch.zeros(8, 8, 3)

@@ -468,8 +468,16 @@ def test_a_camera_that_missed_the_sliders_zoom_is_moved_once_more_and_then_the_s
 @pytest.mark.parametrize("error", [MemoryError(), torch.OutOfMemoryError("CUDA out of memory"), RuntimeError("can't allocate memory")])
 def test_a_picture_that_does_not_fit_into_the_memory_does_not_end_the_page(page, screen, monkeypatch, error):
     monkeypatch.setattr(page._stage, "draw", MagicMock(side_effect=error))
-    page._draw(MagicMock(), Look("base"), screen, 1.0)
+    page._draw(MagicMock(), Look("base"), (pose_of(screen, 2.0), 64, 48), 1.0)
     assert page._controls.figures.content == live_page.OUT_OF_MEMORY
+
+
+@pytest.mark.parametrize("broken", [{"fov": 0.0}, {"fov": math.nan}, {"fov": math.pi}, {"position": (math.nan, 0.0, 0.0)}])
+def test_a_browser_whose_camera_is_none_does_not_end_the_page_for_all(page, screen, monkeypatch, broken):
+    browser = MagicMock()
+    monkeypatch.setattr(live_page, "_view", lambda _: (replace(pose_of(screen, 2.0), **broken), 64, 48))
+    assert not page._serve(1, browser)
+    assert not browser.scene.set_background_image.called and page._controls.figures.content.startswith(("the field of view", "camera 'screen'"))
 
 
 # Words

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import tyro
 
 from mipmap_plugin.commands.common import print_facts, scene, without_none, wrap
-from mipmap_plugin.commands.many import NO_CHECKPOINT, Many, Request, adapt_many
+from mipmap_plugin.commands.many import NO_CHECKPOINT, Many, Request, adapt_many, jobs_of
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.pages import AdaptationPage, look_at
 from mipmap_plugin.commands.terminal_picture import show_before_and_after
@@ -20,6 +20,7 @@ from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.jobs.base import Base
+from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.recipes import recipe as make_config
 
 if TYPE_CHECKING:
@@ -86,21 +87,29 @@ def adapt(
         overwrite: Replace outputs that exist.
         json: Print the reports as JSON.
     """
-    settings = without_none(**vars(changes)) | dict(recipe=recipe, seed=seed)
+    settings, base = without_none(**vars(changes)) | dict(recipe=recipe, seed=seed), Base(Path(), cameras, background, backend, screen_filter, up)
     if many.tiles is not None or many.asked(checkpoints):
         _refuse_for_many(many.holds(checkpoints), scale, bytes, report)
         request = Request(_requests(scale, viewer), output, settings | without_none(most_splats=splats), images, overwrite)
         adapt_jobs = adapt_many if many.tiles is None else adapt_tiled
-        return adapt_jobs(many, checkpoints, request, Base(Path(), cameras, background, backend, screen_filter, up), threads, json)
+        return adapt_jobs(many, checkpoints, request, base, threads, json)
     [checkpoint] = checkpoints
-    wrapped = wrap(Base(checkpoint, cameras, background, backend, screen_filter, up), threads)
+    wrapped = wrap(replace(base, checkpoint=checkpoint), threads)
     most = _most(wrapped, splats, bytes, adapted_path(checkpoint, output, 1.0, several=False), (scale, viewer), settings)
     settings, requests = settings | without_none(most_splats=most), _requests(scale or _fitting(wrapped.model, most), viewer)
     files = [(*request, adapted_path(checkpoint, output, *request, several=len(requests) > 1)) for request in requests]
-    _check(wrapped, files, settings, overwrite)
+    before = _finished(jobs_of(checkpoint, Request(requests, output, settings, images, overwrite), base, several=len(files) > 1), json)
+    left = [file for file in files if file[:2] not in before]
+    _check(wrapped, left, settings, overwrite)
     page = AdaptationPage(checkpoint, [target for *_, target in files], overwrite) if report else None
-    models = _adapted(wrapped, files, settings | dict(images=images and scene(images)))
-    _save_all(wrapped, models, page, overwrite, json)
+    models = _adapted(wrapped, left, settings | dict(images=images and scene(images)))
+    made = dict(zip([file[:2] for file in left], _save_all(wrapped, models, page, overwrite, quiet=json), strict=True))
+    if page:
+        page.write([*made.values()], [*before.values()])
+    if json:
+        print_facts([(before | made)[file[:2]] for file in files], json)
+    elif page:
+        say(look_at(page.path))
 
 
 def _refuse_for_many(given: bool, scales: Sequence[float], size: str | None, page: bool) -> None:
@@ -111,6 +120,16 @@ def _refuse_for_many(given: bool, scales: Sequence[float], size: str | None, pag
         raise SettingsError("several checkpoints, and tiles, need a scale; give --scale")
     if size is not None or page:
         raise SettingsError("--bytes and --report are for one checkpoint at a time, without tiles; leave them out, or adapt them one by one")
+
+
+def _finished(jobs: Sequence[Job], json: bool) -> dict[tuple[float, str | None], dict[str, Any]]:
+    """The reports of the files, by scale and viewer, that an interrupted command has written; of a single file none, which is made or there."""
+    from mipmap_plugin.jobs.finished import finished
+
+    found = {(job.scale, job.viewer): done for job in jobs if len(jobs) > 1 and not job.overwrite and (done := finished(job))}
+    for file, _ in found.values() if not json else ():
+        say(f"{file}: finished before")
+    return {request: {"file": str(file), **report} for request, (file, report) in found.items()}
 
 
 def _check(wrapped: Wrapped, files: Sequence[File], settings: dict[str, Any], overwrite: bool) -> None:
@@ -134,22 +153,19 @@ def _adapted(wrapped: Wrapped, files: Sequence[File], settings: dict[str, Any]) 
         yield wrapped.adapt(scale, viewer=viewer, resume=state_path(target), **settings), target
 
 
-def _save_all(base: Wrapped, models: Iterable[tuple[Adapted, Path]], page: AdaptationPage | None, overwrite: bool, json: bool) -> None:
-    """Save each model as soon as it is adapted, then write the page; print a summary of each, or all reports as JSON."""
+def _save_all(
+    base: Wrapped, models: Iterable[tuple[Adapted, Path]], page: AdaptationPage | None, overwrite: bool, *, quiet: bool
+) -> list[dict[str, Any]]:
+    """Save each model as soon as it is adapted, draw it for the page, and print a summary unless `quiet`; return all reports."""
     reports = []
     for adapted, target in models:
-        reports.append(_saved(adapted, target, overwrite, quiet=json))
-        if not json:
+        reports.append(_saved(adapted, target, overwrite, quiet=quiet))
+        if not quiet:
             show_before_and_after(base, adapted)
         if page:
             page.add(base, adapted.as_written(Path(reports[-1]["file"])))
         del adapted  # before the next is made: its splats, and the truths that its file was measured by, take memory
-    if page:
-        page.write(reports)
-    if json:
-        print_facts(reports, json)
-    elif page:
-        say(look_at(page.path))
+    return reports
 
 
 def _saved(adapted: Adapted, target: Path, overwrite: bool, *, quiet: bool) -> dict[str, Any]:

@@ -55,7 +55,7 @@ def evaluate(
     """Evaluate checkpoints against real images: as they are, with training-free filters, resized, and adapted.
 
     Args:
-        checkpoint: A PLY or a model folder; its cameras, or those given, define the base scale. Required; the results of several are also averaged.
+        checkpoint: A PLY or a model folder; its cameras, or those given, define the base scale. Required; several scenes are also averaged.
         images: Folder of the scene (transforms_*.json or COLMAP's sparse/0, and the images), one for each checkpoint.
         scale: Target focal length over base focal length, such as 1/4 or 4; 1 is the base itself. Required; may be given several times.
         recipe: Also adapt: default, thorough (more steps and views), instant (closed form only), paper (published method), or a registered one.
@@ -80,9 +80,9 @@ def evaluate(
     settings = without_none(seed=seed, steps=steps, upsampler=upsampler, resize=resize, viewer=viewer)
     results = _Results(protocol, _perceptual(lpips, lpips_weights), unique_scales(scale), page, output)
     with results.resumable():
-        for path, folder, own in zip(checkpoint, images, cameras or [None] * len(checkpoint), strict=True):
+        for name, path, folder, own in zip(_names(checkpoint, images), checkpoint, images, cameras or [None] * len(checkpoint), strict=True):
             wrapped, photographs = wrap(Base(path, own, background, backend, screen_filter), threads), _scene(folder, appearance)
-            results.measure(wrapped, photographs, appearance, recipe, settings)
+            results.measure(name, wrapped, photographs, appearance, recipe, settings)
     facts = results.write(checkpoint, output, overwrite)
     print_facts(facts, json) if json else results.print_tables(_title(checkpoint, images, protocol, results.judged), published)
 
@@ -96,35 +96,38 @@ class _Results:
         self._kept = resume_path(written) if written else None
         self._rows, self._notes, self._galleries = list[Any](), dict[str, None](), list[Any]()  # notes each once, in their order
         self.judged = list[int]()  # the number of judged views of each checkpoint
+        self._scenes = list[Path]()
 
     def resumable(self) -> AbstractContextManager[None]:
         """Inside, Ctrl-C says how to go on, and what an earlier command finished is told."""
         return resumable(self._kept, "row")
 
-    def measure(self, wrapped: Wrapped, scene: Scene, appearance: str, recipes: Sequence[str], settings: dict[str, Any]) -> None:
-        """Add the rows and notes of one checkpoint."""
+    def measure(self, name: str, wrapped: Wrapped, scene: Scene, appearance: str, recipes: Sequence[str], settings: dict[str, Any]) -> None:
+        """Add the rows and notes of one checkpoint, whose rows are called by a name."""
         from mipmap_plugin.evaluation import evaluate as evaluation
         from mipmap_plugin.evaluation.cells import Cells
         from mipmap_plugin.evaluation.notes import notes
 
         lpips = self._perceptual and self._perceptual.label
-        asked = {"protocol": self._protocol, "lpips": lpips, "appearance": appearance, "settings": settings, "page": self._page is not None}
+        asked = {"name": name, "protocol": self._protocol, "lpips": lpips, "appearance": appearance, "settings": settings}
         made_from = {"base": wrapped.model.digest, "asked": wrapped.asked, "trained": str(wrapped.trained), "scene": scene.digest()}
-        cells = Cells(self._kept, asked | made_from | {"backend": wrapped.backend()[0].name, "threads": wrapped.threads})
+        machinery = {"page": self._page is not None, "backend": wrapped.backend()[0].name, "threads": wrapped.threads}
+        cells = Cells(self._kept, asked | made_from | machinery)
         judge = evaluation.evaluator_of(wrapped, scene, self._protocol, self._perceptual, cells=cells)
         gallery = evaluation_gallery(wrapped, self._protocol, len(judge.views), recipes) if self._page else None
-        judge = replace(judge, watcher=gallery)
+        judge = replace(judge, watcher=gallery, scene=name)
         self._rows += evaluation.all_rows(wrapped, judge, self._scales, recipes, **settings)
         self._notes |= dict.fromkeys(notes(wrapped, judge, self._scales, recipes, settings, appearance))
         self.judged.append(len(judge.views))
+        self._scenes.append(scene.source.resolve())
         self._galleries.append(gallery)
 
     def write(self, checkpoints: Sequence[Path], output: Path | None, overwrite: bool) -> dict[str, Any]:
-        """Add the means over several checkpoints, write the page and the JSON as far as requested, and return what the JSON holds."""
+        """Add the means over several scenes, write the page and the JSON as far as requested, and return what the JSON holds."""
         from mipmap_plugin.evaluation.evaluate import means
         from mipmap_plugin.evaluation.report import records
 
-        self._rows += means(self._rows) if len(checkpoints) > 1 else []
+        self._rows += means(self._rows) if 1 < len(checkpoints) == len(set(self._scenes)) else []  # several of one scene are compared
         facts = {"rows": records(self._rows), "judged_views": self.judged, "notes": [*self._notes], "report": self._page and str(self._page)}
         if self._page:
             write_evaluation_page(self._page, checkpoints, self._galleries, self._rows, [*self._notes], overwrite)
@@ -141,7 +144,7 @@ class _Results:
 
         say("\n".join([title, table(self._rows), *self._notes]))
         if dataset:
-            say(f"\npublished, {TITLE[dataset]}; rows of different protocols are not comparable")
+            say(f"\npublished, {TITLE[dataset]}; rows of other protocols, and of bases trained at another size, are not comparable")
             rows = published(dataset, self._scales)
             say(published_table(rows) if rows else "there are none at these scales; they are at x1/2, x1/4, x1/8, x2, x4 and x8")
         if self._page:
@@ -152,6 +155,12 @@ def _perceptual(network: Literal["alex", "vgg", "vgg-01"] | None, weights: Path 
     from mipmap_plugin.evaluation.perceptual import Perceptual
 
     return Perceptual(network, weights) if network else None
+
+
+def _names(checkpoints: Sequence[Path], images: Sequence[Path]) -> list[str]:
+    """What the rows of each checkpoint are called by: its scene, and its path where several have a scene of that name."""
+    scenes = [folder.absolute().name for folder in images]
+    return [scene if scenes.count(scene) == 1 else f"{scene}, {path}" for scene, path in zip(scenes, checkpoints, strict=True)]
 
 
 def _scene(folder: Path, appearance: str) -> Scene:

@@ -73,13 +73,13 @@ class AdaptationPage:
 
         self._zooms.append(adaptation_zoom(base, adapted))
 
-    def write(self, reports: Sequence[dict[str, Any]]) -> None:
-        """Write the page, with a report for each file."""
+    def write(self, reports: Sequence[dict[str, Any]], before: Sequence[dict[str, Any]]) -> None:
+        """Write the page, with a report for each file that was drawn, and those of files that were finished `before` an interruption."""
         from mipmap_plugin.pages.html import write_page
         from mipmap_plugin.pages.reports import adaptation_page
 
         titled = [{"title": zoom.label, **report} for zoom, report in zip(self._zooms, reports, strict=True)]
-        write_page(self.path, adaptation_page(self._title, self._zooms, titled, (this_command(),)), self._overwrite)
+        write_page(self.path, adaptation_page(self._title, self._zooms, titled, (this_command(),), before), self._overwrite)
 
 
 def tradeoff_page_path(folder: Path, overwrite: bool) -> Path:

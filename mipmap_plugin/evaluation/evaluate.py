@@ -236,13 +236,20 @@ def means(rows: Sequence[Row]) -> list[Row]:
     """The rows of several scenes averaged as in the papers' tables: one for each scale and name, in their order."""
     groups: dict[tuple[float, str], list[Row]] = {}
     for row in rows:
-        groups.setdefault((row.scale, row.name), []).append(row)
-    return [_averaged(group) for group in groups.values()]
+        groups.setdefault((row.scale, _in_any_viewer(row)), []).append(row)
+    return [_averaged(name, group) for (_, name), group in groups.items()]
 
 
-def _averaged(group: Sequence[Row]) -> Row:
+def _in_any_viewer(row: Row) -> str:
+    """The name of a row; of one that is the worst of several viewers', which differ from scene to scene, without that viewer."""
+    name, worst_of = shown_as(row)
+    return f"{name.rpartition(' in ')[0]}, {worst_of} viewers" if worst_of else name
+
+
+def _averaged(name: str, group: Sequence[Row]) -> Row:
     return replace(
         group[0],
+        name=name,
         scene=f"mean of {len(group)}",
         adapted_on=group[0].adapted_on if len({row.adapted_on for row in group}) == 1 else "each scene's own",
         ended_by="; ".join(dict.fromkeys(row.ended_by for row in group if row.ended_by)),

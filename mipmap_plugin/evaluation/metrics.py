@@ -28,13 +28,18 @@ def psnr(image: Tensor, truth: Tensor) -> float:
 
 
 def ssim(image: Tensor, truth: Tensor) -> float | None:
-    """Mean structural similarity of two images [H, W, 3] clamped to 0..1; None for an image smaller than the window."""
+    """Mean structural similarity of two images [H, W, 3] clamped to 0..1; None for an image smaller than the window.
+
+    Images are padded with black, as by the code of the papers: without their border, which is a fifth of a picture of 100 px, SSIM is another figure.
+    """
     if min(image.shape[:2]) < SSIM_WINDOW:
         return None
     from skimage.metrics import structural_similarity  # here, because it loads all of scipy's statistics, which takes half a second
 
+    border = SSIM_WINDOW // 2  # which scikit-image leaves out
+    padded = [np.pad(_array(each), ((border, border), (border, border), (0, 0))) for each in (truth, image)]
     settings = dict(gaussian_weights=True, sigma=SSIM_SIGMA, use_sample_covariance=False)
-    return float(structural_similarity(_array(truth), _array(image), data_range=1.0, channel_axis=2, **settings))
+    return float(structural_similarity(*padded, data_range=1.0, channel_axis=2, **settings))
 
 
 def _array(image: Tensor) -> np.ndarray:

@@ -7,7 +7,11 @@ from typing import Literal
 
 DataSet = Literal["nerf-synthetic", "mip-nerf-360"]
 
-TITLE = {"nerf-synthetic": "mean over the 8 scenes of NeRF-Synthetic", "mip-nerf-360": "mean over the 9 scenes of mip-NeRF 360"}
+# A zoom is relative to the size that the papers trained at, which is not that of every user's base.
+TITLE = {
+    "nerf-synthetic": "mean over the 8 scenes of NeRF-Synthetic, trained at 800 px for zoom-out and at 100 px for zoom-in",
+    "mip-nerf-360": "mean over the 9 scenes of mip-NeRF 360, trained at full size for zoom-out and at an eighth of it for zoom-in",
+}
 
 # LPIPS in these papers: VGG with images in 0..1. Where a table copies rows of another, the protocol is that of the original.
 LPIPS_LABEL = "LPIPS (vgg, 0..1)"

@@ -62,12 +62,18 @@ class Gallery:
         """The effects of the base."""
         return effects_of_base(self._base)
 
+    def own(self, rows: Sequence[Row]) -> list[Row]:
+        """Those of the rows that are of this scene."""
+        scenes = {shot.scene for shots in self._shots.values() for shot in shots}
+        return [row for row in rows if row.scene in scenes]
+
     def zooms(self, rows: Sequence[Row], *, named: bool = False) -> list[Zoom]:
         """The pictures of each scale, with the means that `rows` have, from the farthest out to the nearest; `named` after their scene."""
-        return [self._zoom(scale, self._shots[scale], rows, named) for scale in sorted(self._shots)]
+        own = self.own(rows)
+        return [self._zoom(scale, self._shots[scale], own, named) for scale in sorted(self._shots)]
 
     def _zoom(self, scale: float, shots: Sequence[Shot], rows: Sequence[Row], named: bool) -> Zoom:
-        means = {name: (_quality(row), note) for row in rows if row.scale == scale and row.scene == shots[0].scene for name, note in (shown_as(row),)}
+        means = {name: (_quality(row), note) for row in rows if row.scale == scale for name, note in (shown_as(row),)}
         in_viewer = any(shot.row.startswith(IN_VIEWER) for shot in shots)
         pictures = [Picture(shot.row, self._role(shot, in_viewer), shot.image, _quality(shot), *means.get(shot.row, ({},))) for shot in shots]
         pictures.append(Picture("truth", "truth", shots[0].truth, note=self._truth))

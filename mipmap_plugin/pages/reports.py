@@ -22,9 +22,10 @@ from mipmap_plugin.wrap import Wrapped
 def evaluation_page(title: str, galleries: Sequence[Gallery], rows: Sequence[Row], **further: Any) -> Page:
     """The page of rows and of the galleries that watched them; `further`: commands and notes."""
     adaptations = [each for gallery in galleries for each in gallery.adaptations]
-    zooms = [zoom for gallery in galleries for zoom in gallery.zooms(rows, named=len(galleries) > 1)]
+    each_with_rows = [(zoom, gallery.own(rows)) for gallery in galleries for zoom in gallery.zooms(rows, named=len(galleries) > 1)]
+    zooms = [zoom for zoom, _ in each_with_rows]
     effects = adaptations[0]["effects"] if adaptations else galleries[0].effects()
-    lead = " ".join(filter(None, (_lead(zoom, rows) for zoom in zooms)))
+    lead = " ".join(filter(None, (_lead(zoom, own) for zoom, own in each_with_rows)))
     return Page(title, lead, zooms=zooms, rows=records(rows), adaptations=adaptations, effects=effects, provenance=versions(), **further)
 
 
@@ -36,10 +37,15 @@ def tradeoff_page(title: str, base: Wrapped, facts: dict[str, Any], commands: Se
     return Page(title, lead, commands, tradeoffs=scales, effects=effects_of_base(base), provenance=facts["machine"], notes=notes)
 
 
-def adaptation_page(title: str, zooms: Sequence[Zoom], adaptations: Sequence[dict[str, Any]], commands: Sequence[str]) -> Page:
-    """The page of adapted files: their pictures (`adaptation_zoom`) and their reports."""
+def adaptation_page(
+    title: str, zooms: Sequence[Zoom], adaptations: Sequence[dict[str, Any]], commands: Sequence[str], before: Sequence[dict[str, Any]] = ()
+) -> Page:
+    """The page of adapted files: their pictures (`adaptation_zoom`) and their reports, and those of files that were finished `before`."""
     lead = " ".join(_gain(zoom, report) for zoom, report in zip(zooms, adaptations, strict=True))
-    notes = list(dict.fromkeys(f"{report['title']}: {note}" for report in adaptations for note in report["notes"]))
+    earlier = [{"title": zoom_label(report["scale"], report["viewer"]), **report} for report in before]
+    adaptations = [*earlier, *adaptations]
+    notes = [f"{report['title']}: it was finished before an interruption, after which its pictures are not drawn again" for report in earlier]
+    notes += dict.fromkeys(f"{report['title']}: {note}" for report in adaptations for note in report["notes"])
     return Page(title, lead, commands, zooms, adaptations=adaptations, effects=adaptations[0]["effects"], provenance=versions(), notes=notes)
 
 
@@ -63,10 +69,14 @@ def adaptation_zoom(base: Wrapped, adapted: Adapted) -> Zoom:
     ]  # fmt: skip
     reason = why_not(base)
     shown = () if reason else viewer_pictures(base, adapted, view.zoomed(scale), images.get(RESIZED) if scale < 1 else None)
-    label = f"{zoom_name(scale)}{f' for {report.viewer}' if report.viewer else ''}"
     against = "the base's own image" + (", made smaller" if scale < 1 else ", with which the image is compared after shrinking" if scale > 1 else "")
     truths, judged_on = f"{against} (no photographs)", "the validation views"
-    return Zoom(label, scale, in_order(pictures), view.name, truths, judged_on, shown, reason, report.settings.recipe)
+    return Zoom(zoom_label(scale, report.viewer), scale, in_order(pictures), view.name, truths, judged_on, shown, reason, report.settings.recipe)
+
+
+def zoom_label(scale: float, viewer: str | None) -> str:
+    """What the zoom of an adapted file is called."""
+    return f"{zoom_name(scale)}{f' for {viewer}' if viewer else ''}"
 
 
 def _psnr(psnr_db: float | None) -> Quality:

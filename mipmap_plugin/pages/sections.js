@@ -10,7 +10,7 @@ function rowsSection() {
     ...(new Set(record.rows.map((row) => row.scene)).size > 1 ? [["scene", (row) => row.scene, ""]] : []),
     ["zoom", (row) => `${zoomName(row.scale)}`, ""], ["what", (row) => row.name, ""],
     ["PSNR dB", (row) => digits(row.psnr_db, 2), "number"], ["SSIM", (row) => digits(row.ssim, 4), "number"],
-    ...(has("lpips") ? [["LPIPS", (row) => digits(row.lpips, 4), "number"]] : []),
+    ...(has("lpips") ? [[record.rows.find((row) => row.lpips_label).lpips_label, (row) => digits(row.lpips, 4), "number"]] : []),
     ["adapt s", (row) => digits(row.adapt_seconds, 1), "number"], ["ms a view", (row) => digits(row.ms_per_view, 0), "number"],
     ["splats", (row) => grouped(row.gaussians), "number"],
   ];

@@ -145,17 +145,18 @@ class Page:
         if seen is not None and not moved and seen.whole and (seen.look, seen.version) == (look, version):
             return True
         since = now if seen is None or moved else seen.since
-        pose, width, height = view
+        _, width, height = view
         coarse = self._pace.fraction(width * height // look.pixel**2) if now - since < STILL_S else 1.0
         if seen is not None and not moved and coarse < 1 and (seen.look, seen.version) == (look, version):
             return False
         self._seen[number] = _Seen(view, look, version, since, coarse == 1)
-        self._draw(client, look, pose.camera(width, height), coarse)
+        self._draw(client, look, view, coarse)
         return False
 
-    def _draw(self, client: Any, look: Look, screen: Camera, coarse: float) -> None:
+    def _draw(self, client: Any, look: Look, view: tuple[Pose, int, int], coarse: float) -> None:
+        pose, width, height = view
         try:
-            picture = self._stage.draw(look, screen, coarse)
+            picture = self._stage.draw(look, pose.camera(width, height), coarse)
         except (MipmapPluginError, MemoryError, RuntimeError) as error:
             if not isinstance(error, MipmapPluginError) and not is_out_of_memory(error):
                 raise

@@ -12,6 +12,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.pixel_size import pixel_size
 from mipmap_plugin.camera import Camera, evenly, viewmat_of
 from mipmap_plugin.effects import NEAR_PLANE
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import MAX_SCALE, MIN_SCALE
 from mipmap_plugin.splatting.rotations import quaternions, rotations
 
@@ -35,7 +36,9 @@ class Pose:
     fov: float  # vertical, radians
 
     def camera(self, width: int, height: int) -> Camera:
-        """The pinhole of an image of `width` x `height` px."""
+        """The pinhole of an image of `width` x `height` px. Raises SettingsError for a field of view that no pinhole has."""
+        if not 0 < self.fov < math.pi:
+            raise SettingsError(f"the field of view has to be above 0 and below 180 degrees, got {math.degrees(self.fov):g}; load the page again")
         rotation = rotations(torch.tensor([self.wxyz], dtype=torch.float64))[0]
         viewmat = viewmat_of(rotation, torch.tensor(self.position, dtype=torch.float64))
         focal = height / (2 * math.tan(self.fov / 2))

@@ -156,6 +156,15 @@ def test_the_adapted_model_is_drawn_with_every_setting_of_a_renderer(points):
     assert drawn["alpha from 1/16"].psnr_db.median != pytest.approx(usual, abs=1e-3)
 
 
+@pytest.mark.parametrize(("scale", "samples"), [(1 / 4, [2]), (1 / 2, []), (0.3, [2]), (2, [2])])
+def test_the_base_is_not_compared_with_itself(scale, samples):
+    """Nor is the truth enlarged and shrunk again, or sampled in as many places as it was."""
+    model, plan = wrapped(), replace(PLAN, supersampling=(2, 4, 8))
+    names = [each.name for each in measuring._baselines(model, base_itself(model, scale, 1), scale, plan)]
+    assert "base, resized" not in names
+    assert [name for name in names if name.startswith("supersampling")] == [f"supersampling, {n} x {n}" for n in samples]
+
+
 def test_the_base_resized_stands_beside_photographs(tmp_path):
     model, scene = wrapped(), load_scene(tiny.scene(tmp_path / "scene"))
     yardstick = photographs(model, scene, 1 / 4, 1)

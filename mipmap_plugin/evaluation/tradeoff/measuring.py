@@ -3,6 +3,7 @@ adaptation. The time to measure quality is not counted, and evaluated views are 
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
@@ -148,10 +149,12 @@ def on_backend(model: Wrapped, name: str) -> Wrapped:
 
 
 def _baselines(model: Wrapped, truth: GroundTruth, scale: float, plan: Plan) -> list[Baseline]:
-    """All baselines, except the one that is the truth itself."""
+    """All baselines, except those that are the truth itself: of the base's own image, resized, and of as many samples as it has pixels."""
     found = baselines(model, scale, truth.shrink_by, filters=_filters(model), samples=plan.supersampling)
     found += [base_in_viewer(plan.viewer, model, scale)] if plan.viewer else []
-    return [baseline for baseline in found if not (truth.is_resized_base and baseline.name == RESIZED)]
+    finest = math.ceil(1 / scale)
+    itself = (RESIZED, f"supersampling, {finest} x {finest}") if truth.is_base else ()
+    return [baseline for baseline in found if baseline.name not in itself]
 
 
 def _filters(model: Wrapped) -> list[str]:

@@ -39,7 +39,7 @@ class GroundTruth:
     adapt_on: list[Camera]  # the other cameras, to adapt to; none: an orbit is generated
     psnr: Callable[[Camera, Tensor], float]  # (one of the views, the image of it at the new scale) -> dB
     shrink_by: str  # the filter that made the truth smaller
-    is_resized_base: bool  # the truth is the base's own image, made smaller
+    is_base: bool  # the truth is the base's own image, to which that image, resized, is no rival
 
 
 def photographs(model: Wrapped, scene: Scene, scale: float, most: int | None) -> GroundTruth:
@@ -74,7 +74,7 @@ def base_itself(model: Wrapped, scale: float, most: int | None, views: Sequence[
     base_images = {view: model.render(view).image.clamp(0, 1) for view in views}
     if scale > 1:
         label = f"dB of the image, shrunk, against the base itself (no photographs), {len(views)} views"
-        return GroundTruth(label, views, adapt_on, lambda view, image: psnr(resize(image, view.size, "area"), base_images[view]), "area", False)
+        return GroundTruth(label, views, adapt_on, lambda view, image: psnr(resize(image, view.size, "area"), base_images[view]), "area", True)
     n = math.ceil(1 / scale)
     label = f"dB against the base supersampled {n} x {n} (no photographs), {len(views)} views"
     truths = {view: resized_base(image, view.zoomed(scale).size, shrink_by="area") for view, image in base_images.items()}
