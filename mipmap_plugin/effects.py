@@ -62,6 +62,8 @@ class Effects:
         if not 0 <= self.eps2d < math.inf or self.sh_degree < 0 or self.supersampling < 1:
             got = f"eps2d {self.eps2d}, sh_degree {self.sh_degree} and supersampling {self.supersampling}"
             raise SettingsError(f"eps2d and sh_degree must be at least 0, and supersampling at least 1, got {got}")
+        if not 0 <= self.near_plane < math.inf:
+            raise SettingsError(f"near_plane must be a number of at least 0, got {self.near_plane}")
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,9 @@ MAX_ALPHA = 0.99
 # the affine approximation would make splats far too large (diff-gaussian-rasterization, forward.cu; gsplat, Utils.cuh).
 FRUSTUM_MARGIN = 0.3
 
+# Kernels divide by what a splat lets through and by what is left behind all splats. These keep both away from 0, and change no picture by 1e-6.
+MOST_OPAQUE, LEAST_LEFT = 1 - 2**-20, 1e-30
+
 TILE = 16  # px
 
 
@@ -145,6 +148,11 @@ class RenderSettings:
     def culls(self) -> bool:
         """Whether any splats are culled."""
         return max(self.min_variance, self.min_contribution, self.least_spread) > 0
+
+    @property
+    def divisible(self) -> tuple[float, float]:
+        """`max_alpha` and `min_transmittance` as kernels use them, which divide by what is left of a pixel."""
+        return min(self.max_alpha, MOST_OPAQUE), max(self.min_transmittance, LEAST_LEFT)
 
     def max_variance(self, width: int, height: int) -> float:
         """The largest variance (px², after dilation) of a splat in a picture of this size."""

@@ -17,6 +17,7 @@ from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.cpu import NO_NUMBA, CpuBackend
 from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.gaussians import Gaussians
@@ -96,6 +97,29 @@ def test_pixels_stop_at_the_least_transmittance():
     image, _, grads = draw(g, camera(), Effects(1))
     torch.testing.assert_close(image.double(), expected_image.detach(), atol=5e-6, rtol=0)
     assert_gradients_close(grads, gradients(expected_image, expected_alpha, g), 1e-4)
+
+
+@needs_numba
+@pytest.mark.parametrize(("count", "opacity", "settings"), [
+    (3, 1.0, RenderSettings(max_alpha=1.0, min_transmittance=0.0)),
+    (20, 1.0, RenderSettings(max_alpha=0.999, min_transmittance=0.0)),
+    (60, 0.9, RenderSettings(max_alpha=0.999, min_transmittance=0.0)),
+])  # fmt: skip
+def test_gradients_of_splats_that_let_nothing_through_are_right(count, opacity, settings):
+    """What is left of a pixel is less than float32 holds, or nothing; the backward pass divides by it."""
+    depths = torch.linspace(1.0, 2.0, count)
+    means = torch.stack([depths * 0, depths * 0, depths], 1)
+    splats = Gaussians(means, torch.eye(4)[:1].expand(count, 4), torch.full((count, 3), 5.0), torch.full((count,), opacity), torch.rand(count, 1, 3))
+    view, effects = Camera(5, 5, 10.0, 10.0, 2.5, 2.5, torch.eye(4)), Effects(0, settings=settings)
+    grads, images = [], []
+    for backend, dtype in ((BACKEND, torch.float32), (ReferenceBackend(), torch.float64)):
+        own = leaf(splats.to(dtype=dtype))
+        rendered = backend.render(own, view, effects)
+        images.append(rendered.image.detach().double())
+        grads.append(gradients(rendered.image, rendered.alpha, own))
+    torch.testing.assert_close(*images, atol=1e-5, rtol=1e-5)
+    for name in ("means", "sh"):
+        torch.testing.assert_close(grads[0][name], grads[1][name], atol=1e-5 * float(grads[1][name].abs().max()), rtol=1e-3)
 
 
 @needs_numba

@@ -35,6 +35,7 @@ NO_LEAST_COMPENSATION = {f"scale-{size}-antialiased" for size in ("0-on-two-axes
     "antialiased-1", "antialiased-2",
 }  # fmt: skip
 TWINS_ROOT_AT_ZERO = {"scale-0-on-three-axes-antialiased", "scale-0-on-three-axes-mip", "scale-1e-20-mip"}  # its kernel divides by a little more
+ONLY_BEFORE_TORCH_2_14 = TWINS_ROOT_AT_ZERO | {"scale-1e-20-antialiased"}  # whose gradient of a clamped 0 under a root is NaN
 KNOWN = FEWER_DIGITS | LARGER_ALPHA | NO_LEAST_COMPENSATION | TWINS_ROOT_AT_ZERO
 
 
@@ -91,7 +92,7 @@ def test_covariances_are_passed_on(stand_in):
 def test_gsplats_twins_draw_the_reference_but_for_what_is_known(stand_in):
     cases = {name: build for name, build in CASES.items() if not name.startswith("10000")}  # too slow in the Python loops of the stand-in
     outcomes = check_backend(OnProcessor(), cases)
-    assert {outcome.case for outcome in outcomes if not outcome.passed} == KNOWN
+    assert {outcome.case for outcome in outcomes if not outcome.passed} in (KNOWN, KNOWN - ONLY_BEFORE_TORCH_2_14)
     drawn = [outcome for outcome in outcomes if not outcome.skipped]
     integrated = {case for case in cases if "analytic" in case or "window" in case}
     of_a_viewer = {case for case, build in cases.items() if build().effects.settings != RenderSettings()}

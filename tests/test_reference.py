@@ -14,6 +14,7 @@ from mipmap_plugin.backends.supersample import render
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.render_settings import USUAL, RenderSettings
 from mipmap_plugin.screen_filters import SCREEN_FILTERS
 from mipmap_plugin.splatting import compositing
 from mipmap_plugin.splatting.filters import footprint
@@ -50,6 +51,25 @@ def test_covariances_override_quats_and_scales():
     covariances = rotation @ torch.diag_embed(g.scales**2) @ rotation.mT
     turned = Gaussians(g.means, g.quats, g.scales, g.opacities, g.sh, covariances)
     torch.testing.assert_close(BACKEND.render(turned, camera(), Effects(1)).image, brute_force(turned, camera())[0], atol=1e-10, rtol=0)
+
+
+@pytest.mark.parametrize(("scales", "settings"), [
+    ((100.0, 1e-16, 1e-20), USUAL),
+    ((6e4, 8e-24, 0.0), USUAL),
+    ((1e10, 0.04, 3e-8), RenderSettings(least_spread=0.1)),
+    ((1e10, 1e9, 3e-8), RenderSettings(radius=3.0, max_half_axis=50.0)),
+    ((1e10, 1e9, 3e-8), RenderSettings(min_variance=0.125)),
+])  # fmt: skip
+def test_splats_far_thinner_or_wider_than_a_picture_have_finite_gradients_in_float32(scales, settings):
+    quats = torch.tensor([[1.0, 0.2, 0.1, 0.4], [0.3, -0.6, 0.2, 0.1], [0.0, -0.1, 0.9, 0.1]])
+    means = torch.tensor([[0.0, 0.1, 2.0], [0.1, 0.0, 3.0], [0.0, 0.0, 4.0]])
+    parts = [means, quats, torch.tensor([scales] * 3), torch.full((3,), 0.9), torch.rand(3, 1, 3, generator=torch.Generator().manual_seed(0))]
+    splats = Gaussians(*(part.requires_grad_() for part in parts))
+    view = Camera(20, 16, 30.0, 25.0, 10.0, 8.0, torch.eye(4))
+    rendered = BACKEND.render(splats, view, Effects(0, eps2d=0.0 if settings is USUAL else 0.3, settings=settings))
+    assert rendered.image.isfinite().all()
+    grads = torch.autograd.grad(rendered.image.sum(), parts, allow_unused=True, materialize_grads=True)
+    assert all(grad.isfinite().all() for grad in grads)
 
 
 def test_batches_do_not_change_the_image(monkeypatch):

@@ -21,9 +21,9 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects, explain
 from mipmap_plugin.errors import PluginError, SettingsError
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.render_settings import USUAL, EvenBuckets, RenderSettings
+from mipmap_plugin.render_settings import USUAL, EvenBuckets, Packing, RenderSettings
 from mipmap_plugin.splatting.buckets import even_ranks, ranks, ranks_of_views
-from mipmap_plugin.splatting.packing import packed
+from mipmap_plugin.splatting.packing import in_two_steps, packed
 from mipmap_plugin.splatting.viewers import BUILT_IN, EDGE, Viewer, find_viewer
 from mipmap_plugin.wrap import Wrapped
 
@@ -615,6 +615,22 @@ def test_packed_rotations_are_nearly_what_they_were(viewer, most):
     degrees = torch.rad2deg(2 * dots.clamp(max=1).acos())
     assert 0.01 < degrees.max() < most
     assert torch.allclose(kept.quats.norm(dim=1), splats.quats.norm(dim=1))
+
+
+@BOTH
+def test_a_largest_alpha_below_that_of_the_edge_leaves_the_splat_its_size(backend):
+    """Half of its peak is left at the edge, and alpha is clamped to 0.3."""
+    settings = RenderSettings(radius=math.sqrt(2 * math.log(2)), max_alpha=0.3)
+    alpha = backend.render(splat(2.0, 2.0, 1.0), camera(), Effects(0, eps2d=0.0, settings=settings)).alpha
+    assert alpha[MIDDLE, MIDDLE] == alpha[MIDDLE, MIDDLE + 1] == pytest.approx(0.3)
+    assert alpha[MIDDLE, MIDDLE + 2] == 0
+
+
+def test_packing_in_two_steps_is_packing_in_one():
+    packing = Packing(opacity=(1 / 63,), half_means=True)
+    once, rest = in_two_steps(packing)
+    splats, view = samples.gaussians(100), samples.camera()
+    assert torch.equal(packed(packed(splats, view, once), view, rest).opacities, packed(splats, view, packing).opacities)
 
 
 def test_packed_twice_is_packed():

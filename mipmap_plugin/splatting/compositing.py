@@ -44,8 +44,7 @@ def independent(
 
     def alphas(footprints: Tensor, dx: Tensor, dy: Tensor, least: Tensor) -> Tensor:
         raw = alpha(footprints, dx, dy)
-        drawn = raw.clamp_max(max_alpha) >= least
-        return torch.where(drawn, (footprints[..., -1] * raw if gated else raw).clamp_max(max_alpha), 0.0)
+        return torch.where(raw >= least, (footprints[..., -1] * raw if gated else raw).clamp_max(max_alpha), 0.0)
 
     return alphas
 

@@ -41,9 +41,10 @@ def gate(shape: tuple[Tensor, Tensor, Tensor, Tensor], opacities: Tensor, settin
 
 def spread(shape: tuple[Tensor, Tensor, Tensor, Tensor]) -> Tensor:
     """Half the difference of the variances along a splat's two axes, [N] px²."""
-    squared = ((shape[0] - shape[2]) / 2).square() + shape[1].square()
-    # `where` before the root as well as after it: the root's gradient at 0 is infinite, and infinity times zero is NaN.
-    return torch.where(squared > 0, torch.where(squared > 0, squared, 1.0).sqrt(), 0.0)
+    half, xy = (shape[0] - shape[2]) / 2, shape[1]
+    is_round = (half == 0) & (xy == 0)
+    # `hypot`, for squares could overflow; `where` before it as well as after, for its gradient at 0 is NaN.
+    return torch.where(is_round, 0.0, torch.hypot(torch.where(is_round, 1.0, half), xy))
 
 
 def stretched(shape: tuple[Tensor, Tensor, Tensor, Tensor], drawn: Tensor, least: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -55,7 +56,8 @@ def stretched(shape: tuple[Tensor, Tensor, Tensor, Tensor], drawn: Tensor, least
     xx, xy, yy, _ = shape
     mean, half = (xx + yy) / 2, (xx - yy) / 2
     changed = drawn & (spread(shape) < least)
-    up = torch.where(changed, least - half, 1.0)
+    # `where` before the squares as well as after: those of the others may overflow, and infinity times zero is NaN.
+    up, xy = torch.where(changed, least - half, 1.0), torch.where(changed, xy, 0.0)
     squared = xy.square() + up.square()
     cos, sin = least * (xy.square() - up.square()) / squared, least * 2 * xy * up / squared
     stretch = mean + cos, sin, mean - cos, mean.square() - least**2

@@ -20,6 +20,9 @@ LEAST_COMPENSATION = {name: screen_filter.min_compensation for name, screen_filt
 # Filters that integrate over the pixel instead of sampling its center.
 INTEGRALS = {"analytic": PixelIntegral, "window": WindowIntegral}
 
+# px²: splats of less variance across are not drawn; they hit no pixel's center, and their gradients would overflow float32.
+THINNEST = 1e-30
+
 # px², the variance of a square of one pixel.
 SQUARE_VARIANCE = 1 / 12
 
@@ -60,13 +63,14 @@ class Footprint:
     def alpha(self, packed: Tensor, dx: Tensor, dy: Tensor) -> Tensor:
         """Alpha of splats [..., 4 or 5] at pixels dx, dy px from their centers, not clamped, and regardless of the gate."""
         yy, shear, across, opacity = packed.unbind(-1)[:4]
-        weight = torch.exp(-(dy.square() / yy + (dx - shear * dy).square() / across) / 2)
+        # Divided before they are squared: the gradient of x² / v is x² / v², which overflows for splats far thinner than a pixel.
+        weight = torch.exp(-((dy / yy.sqrt()).square() + ((dx - shear * dy) / across.sqrt()).square()) / 2)
         return opacity * ((weight - self.w_end) / (1 - self.w_end) if self.w_end else weight)
 
     def visible(self, min_alpha: Tensor) -> Tensor:
         """Which splats are finite and reach `min_alpha` [N] somewhere, [N] bool."""
         finite = torch.isfinite(torch.stack([self.yy, self.shear, self.across, self.xx, self.opacities])).all(0)
-        return finite & (self.opacities >= min_alpha) & (self.across > 0)
+        return finite & (self.opacities >= min_alpha) & (self.across > THINNEST)
 
     def extents(self, min_alpha: Tensor) -> Tensor:
         """Half-sizes of the box around each ellipse alpha >= `min_alpha` [N], [N, 2] px, without gradient."""

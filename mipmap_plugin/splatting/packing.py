@@ -55,7 +55,7 @@ def _rounded(gaussians: Gaussians, camera: Camera, packing: Packing) -> dict[str
 
 def in_two_steps(packing: Packing) -> tuple[Packing, Packing | None]:
     """What of a packing is the same for every camera, and the rest, which is not; None if there is none."""
-    return replace(packing, half_means=False), Packing(half_means=True) if packing.half_means else None
+    return replace(packing, half_means=False), Packing(opacity=(), half_means=True) if packing.half_means else None
 
 
 def round_to(values: Tensor, steps: Tensor) -> Tensor:

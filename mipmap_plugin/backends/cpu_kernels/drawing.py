@@ -90,7 +90,7 @@ def _blank(projected: Projection, lists: Lists) -> Drawing:
     shot, view, flags, of = projected
     (height, width), settings = of.size, shot.effects.settings
     frame = Frame(np.array(shot.effects.background, np.float32), empty(height, width), empty(height, width))
-    limits = Limits(settings.max_alpha, settings.min_transmittance, settings.picture_step or 0.0)
+    limits = Limits(*settings.divisible, settings.picture_step or 0.0)
     return Drawing(view, flags, limits, of.table, lists, frame, empty(height, width, 3), empty(height, width))
 
 

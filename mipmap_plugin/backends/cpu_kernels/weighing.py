@@ -25,7 +25,7 @@ from mipmap_plugin.render_settings import MIN_ALPHA
 def weigh(splats: SplatArrays, camera: Camera, effects: Effects, ranks: np.ndarray | None = None) -> np.ndarray:
     """The sum of each splat's blend weights over the pixels of an image, [N] float32. Arguments: as of `drawing.draw`; not for windows."""
     view, flags = view_of(camera, effects, splats, False)
-    limits = Limits(effects.settings.max_alpha, effects.settings.min_transmittance, 0.0)
+    limits = Limits(*effects.settings.divisible, 0.0)
     count, (height, width) = len(splats.means), camera.size
     projected, threads = sorting.Projected.of(count, camera.size), team(count + width * height)
     threads.share(projection.project, count, flags, view, splats, *projected.arrays, of_rows=True)

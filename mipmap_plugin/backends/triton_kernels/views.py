@@ -66,7 +66,7 @@ def _of_camera(camera: Camera, effects: Effects, tile: int) -> tuple[float, ...]
         *(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x),
         *(-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y),
         *(effects.near_plane, effects.eps2d, filters.LEAST_COMPENSATION[effects.screen_filter] ** 2, effects.settings.min_alpha),
-        *(effects.sh_degree, effects.settings.min_transmittance),
+        *(effects.sh_degree, effects.settings.divisible[1]),
         *effects.background,
         float(filters.compensates(effects.screen_filter)),
         *(camera.width, camera.height, triton.cdiv(camera.width, tile), triton.cdiv(camera.height, tile)),
@@ -76,7 +76,7 @@ def _of_camera(camera: Camera, effects: Effects, tile: int) -> tuple[float, ...]
 def _of_settings(camera: Camera, settings: RenderSettings, gradients: bool) -> tuple[float, ...]:
     is_cut = settings.radius is not None and not settings.fades
     return (
-        *(settings.max_alpha, settings.frame, math.inf if settings.max_color is None else settings.max_color),
+        *(settings.divisible[0], settings.frame, math.inf if settings.max_color is None else settings.max_color),
         *(settings.color_steps or (0.0, 0.0, 0.0)),
         *(filters.w_end(settings), -(settings.radius**2) / 2 / math.log(2) if is_cut else -math.inf),
         *(float(settings.radial), float(settings.boxed), float(settings.rooted), float(gradients)),
