@@ -322,6 +322,9 @@ def test_ctrl_c_between_two_files_and_the_same_command_goes_on(run, model_folder
     code, out, err = run(*command, "--json")
     again = json.loads(out)
     assert (code, err) == (0, "") and [report["scale"] for report in again] == [0.25, 0.5]
+    assert [Path(report["file"]).relative_to(tmp_path / "new") for report in again] == [
+        Path(report["file"]).relative_to(tmp_path / "whole") for report in whole
+    ]
     assert [splats_of(report) for report in again] == [splats_of(report) for report in whole]
     record = record_of(tmp_path / "new" / "base_adapted.report.html")
     assert [report["title"] for report in record["adaptations"]] == ["×1/4", "×1/2"] and [zoom["label"] for zoom in record["zooms"]] == ["×1/2"]

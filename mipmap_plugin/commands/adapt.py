@@ -98,16 +98,16 @@ def adapt(
     most = _most(wrapped, splats, bytes, adapted_path(checkpoint, output, 1.0, several=False), (scale, viewer), settings)
     settings, requests = settings | without_none(most_splats=most), _requests(scale or _fitting(wrapped.model, most), viewer)
     files = [(*request, adapted_path(checkpoint, output, *request, several=len(requests) > 1)) for request in requests]
-    before = _finished(jobs_of(checkpoint, Request(requests, output, settings, images, overwrite), base, several=len(files) > 1), json)
+    before = _finished(jobs_of(checkpoint, Request(requests, output, settings, images, overwrite), base, several=len(files) > 1), files, json)
     left = [file for file in files if file[:2] not in before]
     _check(wrapped, left, settings, overwrite)
     page = AdaptationPage(checkpoint, [target for *_, target in files], overwrite) if report else None
     models = _adapted(wrapped, left, settings | dict(images=images and scene(images)))
-    made = dict(zip([file[:2] for file in left], _save_all(wrapped, models, page, overwrite, quiet=json), strict=True))
+    made = _save_all(wrapped, models, page, overwrite, quiet=json)
     if page:
-        page.write([*made.values()], [*before.values()])
+        page.write(made, [*before.values()])
     if json:
-        print_facts([(before | made)[file[:2]] for file in files], json)
+        print_facts([before.get(file[:2]) or made.pop(0) for file in files], json)
     elif page:
         say(look_at(page.path))
 
@@ -122,11 +122,16 @@ def _refuse_for_many(given: bool, scales: Sequence[float], size: str | None, pag
         raise SettingsError("--bytes and --report are for one checkpoint at a time, without tiles; leave them out, or adapt them one by one")
 
 
-def _finished(jobs: Sequence[Job], json: bool) -> dict[tuple[float, str | None], dict[str, Any]]:
-    """The reports of the files, by scale and viewer, that an interrupted command has written; of a single file none, which is made or there."""
+def _finished(jobs: Sequence[Job], files: Sequence[File], json: bool) -> dict[tuple[float, str | None], dict[str, Any]]:
+    """The reports of the files, by scale and viewer, that an interrupted command has written; none of a single file, which is made or refused.
+
+    `jobs`: what would make each of them.
+    """
     from mipmap_plugin.jobs.finished import finished
 
-    found = {(job.scale, job.viewer): done for job in jobs if len(jobs) > 1 and not job.overwrite and (done := finished(job))}
+    kept = len(files) > 1 and not jobs[0].overwrite
+    there = {file[:2]: finished(replace(job, target=file[2])) if kept else None for job, file in zip(jobs, files, strict=True)}
+    found = {request: done for request, done in there.items() if done}
     for file, _ in found.values() if not json else ():
         say(f"{file}: finished before")
     return {request: {"file": str(file), **report} for request, (file, report) in found.items()}
