@@ -39,6 +39,12 @@ def test_the_cameras_in_the_folder_of_the_base_are_found(base, tmp_path):
     assert torch.equal(poses(instant(base, tmp_path / "elsewhere" / "adapted.ply")), poses(base))
 
 
+def test_they_are_found_beside_options_that_cannot_be_read(base, tmp_path):
+    """Some projects write what is no literal; the base itself is read without its options, too."""
+    (base / "cfg_args").write_text("Namespace(sh_degree=1, mode=<Mode.FAST: 1>)")
+    assert torch.equal(poses(instant(base, tmp_path / "adapted.ply")), poses(base))
+
+
 def test_cameras_that_were_given_are_found(base, tmp_path):
     cameras = write_cameras(tmp_path / "given.json", tiny.cameras(3))
     adapted = instant(tiny.ply(tmp_path / "lone.ply"), tmp_path / "adapted.ply", cameras)

@@ -328,7 +328,7 @@ def test_ctrl_c_between_two_files_and_the_same_command_goes_on(run, model_folder
     assert [splats_of(report) for report in again] == [splats_of(report) for report in whole]
     record = record_of(tmp_path / "new" / "base_adapted.report.html")
     assert [report["title"] for report in record["adaptations"]] == ["×1/4", "×1/2"] and [zoom["label"] for zoom in record["zooms"]] == ["×1/2"]
-    assert record["notes"][0] == "×1/4: it was finished before an interruption, after which its pictures are not drawn again"
+    assert record["notes"][0] == "×1/4: an earlier command made it, and its pictures are not drawn again"
 
 
 def test_adapt_to_the_bases_own_scale_gives_the_base(run, model_folder, tmp_path):

@@ -14,7 +14,7 @@ from torch_checkpoints import gsplat_folder, splatfacto_folder, splats
 
 from mipmap_plugin.adaptation.target.photographs import placed
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.hosts import Capture
+from mipmap_plugin.models.hosts import Capture, held_out
 from mipmap_plugin.scenes import Scene, load_scene, read_cameras, write_cameras
 
 EYE = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
@@ -111,10 +111,16 @@ def test_gsplat_holds_out_the_views_that_its_options_say(tmp_path):
     assert here.notes == ["other", "the checkpoint's options hold out 1 of 10 views: these are for testing"]
 
 
+def test_views_are_held_out_in_the_order_of_their_files():
+    """gsplat and nerfstudio sort names with their endings: a-1.jpg comes before a.jpg."""
+    cameras = [replace(view, name=name) for name, view in zip(["a", "a-1", "b"], tiny.cameras(3), strict=True)]
+    assert [camera.name for camera in held_out(cameras, [0]) if camera.split == "test"] == ["a-1"]
+
+
 @pytest.mark.parametrize(
     ("options", "tests"),
     [("eval_mode: fraction\ntrain_split_fraction: 0.75", [4, 9]), ("eval_mode: interval\neval_interval: 4", [0, 4, 8]),
-     ("eval_mode: filename", [3, 9]), ("eval_mode: all", []), ("", [])],
+     ("eval_mode: interval", [0, 8]), ("eval_mode: filename", [3, 9]), ("eval_mode: all", []), ("", [])],
 )  # fmt: skip
 def test_nerfstudio_holds_out_the_views_that_its_config_says(tmp_path, options, tests):
     """data/utils/dataparsers_utils.py, in the order of names, whatever that of the frames is."""
@@ -127,7 +133,7 @@ def test_nerfstudio_holds_out_the_views_that_its_config_says(tmp_path, options, 
     assert sorted(held_out) == [names[number] for number in tests]
     eighths = tuple(replace(camera, split="test" if number % 8 == 0 else "train") for number, camera in enumerate(cameras[::-1]))
     colmap = placed(load_model(tmp_path / "r"), Scene(eighths, {}, tmp_path, points=torch.zeros(1, 3))).split("test")
-    assert [camera.name for camera in colmap] == [names[number] for number in ([0, 8] if options == "" or "interval" in options else tests)]
+    assert [camera.name for camera in colmap] == [names[number] for number in (tests if options else [0, 8])]
     listed = Scene((replace(cameras[0], split="test"), *cameras[1:]), {}, tmp_path)  # by the file of the scene, which wins
     assert [camera.name for camera in placed(load_model(tmp_path / "r"), listed).split("test")] == [cameras[0].name]
 

@@ -36,8 +36,8 @@ def where(scene: Path | None, folder: Path | None) -> dict[str, str]:
     return {} if read_from is None or any(map(is_temporary, places.values())) else places
 
 
-def _of_base(source: Path | None) -> tuple[Scene, dict[str, str]] | None:
-    """The scene that the base of the file `source` was seen by, and `where` it is; None if `source` is a base, or was adapted without cameras.
+def _of_base(source: Path | None) -> tuple[list[Camera] | Scene, dict[str, str]] | None:
+    """The cameras of the base of the file `source`, or their scene, and `where` they are; None if `source` is a base, or was adapted without any.
 
     A warning says so where they are gone, or are others by now.
     """
@@ -48,11 +48,15 @@ def _of_base(source: Path | None) -> tuple[Scene, dict[str, str]] | None:
                 options = others.get("options")
             case _:
                 return None
-        scene = load_scene(opened(Path(place)), read_options(opened(Path(options)) if isinstance(options, str) else None)[0])
-        reason = "" if digest_of(scene.cameras) == wanted else f"the cameras in {place} are others now"
+        folder = opened(Path(options)) if isinstance(options, str) else None
+        cfg, scene = read_options(folder)[0], opened(Path(place))
+        # Those of the base's own folder as it reads them, also where its options cannot be read.
+        found = (scene == folder and model_cameras(folder, cfg)) or load_scene(scene, cfg)
+        cameras = found.cameras if isinstance(found, Scene) else found
+        reason = "" if digest_of(cameras) == wanted else f"the cameras in {place} are others now"
     except (MipmapPluginError, OSError) as error:
         reason = str(error)
     if reason:
         warnings.warn(f"{source} was adapted with cameras that are not found any more ({reason}): {GONE}", stacklevel=3)
         return None
-    return scene, report["cameras_from"]
+    return found, report["cameras_from"]

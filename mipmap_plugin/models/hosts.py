@@ -44,8 +44,13 @@ class Host(Protocol):
         """
 
 
+def as_file(name: str) -> str:
+    """What the names of views are sorted by, which lack their endings: the files `a-1.jpg` and `a (2).jpg` come before `a.jpg`."""
+    return f"{name}."
+
+
 def held_out(cameras: Sequence[Camera], tests: Collection[int]) -> list[Camera]:
-    """The cameras, of which those at the places `tests` in the order of their names are for testing, and all others for training."""
-    by_name = sorted(range(len(cameras)), key=lambda number: cameras[number].name)
+    """The cameras, of which those at the places `tests` in the order of their files' names are for testing, and all others for training."""
+    by_name = sorted(range(len(cameras)), key=lambda number: as_file(cameras[number].name))
     chosen = {by_name[place] for place in tests}
     return [replace(camera, split="test" if number in chosen else "train") for number, camera in enumerate(cameras)]

@@ -24,7 +24,7 @@ from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import OPACITY_MARGIN
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.health import without_invalid
-from mipmap_plugin.models.hosts import Capture, held_out
+from mipmap_plugin.models.hosts import Capture, as_file, held_out
 from mipmap_plugin.models.places import SPLATFACTO
 from mipmap_plugin.models.tagged import as_tagged
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
@@ -82,11 +82,10 @@ class SplatfactoHost:
     def as_trained(self, cameras: Sequence[Camera], capture: Capture, means: Tensor) -> list[Camera]:
         """Transform the cameras by dataparser_transforms.json, and shrink large images as nerfstudio does. Raises SceneError.
 
-        Those views are for testing that the config holds out, unless the scene says it: a transforms.json by its lists, and COLMAP's every eighth are
-        those of nerfstudio's own reader of COLMAP.
+        Those views are for testing that the config holds out, unless it says nothing of that, or a transforms.json has lists of its own.
         """
-        names, mode = [camera.name for camera in cameras], self.options.get("eval_mode")
-        said = any(camera.split == "test" for camera in cameras) if capture.points is None else mode in (None, "interval")
+        names = [camera.name for camera in cameras]
+        said = any(camera.split == "test" for camera in cameras) if capture.points is None else "eval_mode" not in self.options
         if not said and len(set(names)) == len(names):
             cameras = held_out(cameras, _tests(names, self.options))
         frame = self._frame()
@@ -191,14 +190,14 @@ def _unusual_options(pipeline: Mapping[str, Any], options: dict[str, Any]) -> li
 
 def _tests(names: list[str], options: dict[str, Any]) -> list[int]:
     """The places of the test views in the order of `names` (data/utils/dataparsers_utils.py); none if the config does not tell."""
-    count, interval, share = len(names), options.get("eval_interval"), options.get("train_split_fraction")
+    count, interval, share = len(names), options.get("eval_interval", 8), options.get("train_split_fraction")
     match options.get("eval_mode"):
         case "fraction" if isinstance(share, (int, float)) and 0 < share <= 1:
             return sorted({*range(count)} - {*np.linspace(0, count - 1, math.ceil(count * share), dtype=int).tolist()})
         case "interval" if isinstance(interval, int) and interval > 0:
             return list(range(0, count, interval))
         case "filename":
-            return [place for place, name in enumerate(sorted(names)) if "eval" in name and "train" not in name]
+            return [place for place, name in enumerate(sorted(names, key=as_file)) if "eval" in name and "train" not in name]
     return []
 
 

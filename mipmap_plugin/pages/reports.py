@@ -44,7 +44,7 @@ def adaptation_page(
     lead = " ".join(_gain(zoom, report) for zoom, report in zip(zooms, adaptations, strict=True))
     earlier = [{"title": zoom_label(report["scale"], report["viewer"]), **report} for report in before]
     adaptations = [*earlier, *adaptations]
-    notes = [f"{report['title']}: it was finished before an interruption, after which its pictures are not drawn again" for report in earlier]
+    notes = [f"{report['title']}: an earlier command made it, and its pictures are not drawn again" for report in earlier]
     notes += dict.fromkeys(f"{report['title']}: {note}" for report in adaptations for note in report["notes"])
     return Page(title, lead, commands, zooms, adaptations=adaptations, effects=adaptations[0]["effects"], provenance=versions(), notes=notes)
 
