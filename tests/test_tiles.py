@@ -7,6 +7,7 @@ import json
 from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import anchor_checkpoints
 import numpy as np
@@ -43,7 +44,7 @@ from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.screen_filters import DILATION
 from mipmap_plugin.tiles import plan, run, slabs, steering, tile, truth
 from mipmap_plugin.tiles.cut import cut, front_to_back
-from mipmap_plugin.tiles.folder import work_folder
+from mipmap_plugin.tiles.folder import truth_file, work_folder
 from mipmap_plugin.tiles.halo import draw_halos
 from mipmap_plugin.tiles.layers import draw_layers
 from mipmap_plugin.tiles.pictures import Album, write_pictures
@@ -716,6 +717,21 @@ def test_views_that_show_nothing_are_refused_and_leave_no_folder(job):
     with pytest.raises(SettingsError, match="none of the 3 views shows a splat: the cameras seem to be of another scene"):
         adapt_in_tiles(replace(job, base=replace(job.base, cameras=folder / "cameras.json")), 2)
     assert not work_folder(job.target).exists()
+
+
+def test_what_an_earlier_command_did_stays_where_views_are_refused(job, monkeypatch):
+    """Of several scales one may be refused that it was not asked for."""
+    real = run.cut_for
+
+    def gone_on_with(jobs, tiles):
+        real(jobs, tiles)
+        truth_file(work_folder(job.target), 0).touch()
+
+    monkeypatch.setattr(run, "cut_for", gone_on_with)
+    monkeypatch.setattr(run, "refuse_blind", Mock(side_effect=SettingsError("none of the views")))
+    with pytest.raises(SettingsError, match="none of the views"):
+        adapt_in_tiles(job, 2)
+    assert truth_file(work_folder(job.target), 0).exists()
 
 
 def test_validation_views_that_show_nothing_do_not_count(job, monkeypatch):

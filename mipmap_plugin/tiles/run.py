@@ -95,8 +95,9 @@ def _examine_views(jobs: Sequence[Job]) -> None:
             refuse_blind(views, model, near, partial(draw_base, scene), scene.scale)
         except SettingsError:
             close_opened()
-            for job in jobs:
-                shutil.rmtree(work_folder(job.target))  # nothing was done yet, and other cameras need another one
+            for folder in (work_folder(job.target) for job in jobs):
+                if not truth_file(folder, 0).exists():  # it was only cut, and other cameras need another folder
+                    shutil.rmtree(folder)
             raise
         orbit = not scene.wrapped.cameras or scene.config.views == "orbit"
         for remark in filter(None, [*remarks(views, model, near, orbit=orbit), too_unlike(views)]):
