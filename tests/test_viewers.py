@@ -219,6 +219,18 @@ def test_a_splat_ends_and_is_covered_as_in_the_program(backend, viewer, radius, 
 
 
 @BOTH
+def test_lichtfeld_draws_half_a_step_of_8_bits_and_leaves_out_by_the_center(backend):
+    """Its rasterizer of 2026; that of 2025 drew as Brush does."""
+    def seen(viewer, opacity, halves=0.0):
+        return alpha(backend, viewer, splat(900.0, 900.0, opacity, means=(halves * SIZE / 2 * DEPTH / FOCAL, 0.0, DEPTH))).max()
+
+    assert seen("lichtfeld", 0.7 / 255) > 0 == seen("brush", 0.7 / 255) == seen("lichtfeld", 0.4 / 255)
+    assert seen("lichtfeld", 0.9, 1.39) > 0.5 and seen("lichtfeld", 0.9, 1.41) == 0 < seen("brush", 0.9, 1.41)
+    bright = backend.render(splat(4.0, 4.0, 0.5, 9.0), camera(), find_viewer("lichtfeld").effects(Effects(0))).image
+    assert bright[MIDDLE, MIDDLE, 0].item() == pytest.approx(0.5 * 4, abs=1e-5)
+
+
+@BOTH
 def test_a_long_splat_keeps_its_shape(backend):
     stretching, plain = find_viewer("gaussian-splats-3d").effects(Effects(0)), replace(find_viewer("gaussian-splats-3d"), settings=USUAL)
     long = splat(4.0, 1.0, turn=0.5)
@@ -673,7 +685,7 @@ def test_the_usual_viewers_have_the_usual_settings():
 
 
 def test_supersplat_is_playcanvas_and_every_record_is_under_its_name():
-    assert find_viewer("supersplat") is find_viewer("playcanvas") and find_viewer("lichtfeld") is find_viewer("brush")
+    assert find_viewer("supersplat") is find_viewer("playcanvas")
     assert all(find_viewer(viewer.name) is viewer and viewer.source and viewer.title for viewer in BUILT_IN)
 
 

@@ -62,8 +62,8 @@ READ_GLB = ("playcanvas", "playcanvas-webgpu", "playcanvas-aa", "three", "babylo
 NO_GLB = {
     **{
         viewer: f"{viewer} reads no splats in glTF"
-        for viewer in ("spark", "gaussian-splats-3d", "gsplat-js", "antimatter15", "aframe", "mip", "brush", "web-splat", "visionary",
-                       "metalsplatter", "vk-gaussian-splatting", "splatapult", "gdgs", "3dgs.cpp")
+        for viewer in ("spark", "gaussian-splats-3d", "gsplat-js", "antimatter15", "aframe", "mip", "brush", "lichtfeld", "web-splat",
+                       "visionary", "metalsplatter", "vk-gaussian-splatting", "splatapult", "gdgs", "3dgs.cpp")
     },
     "cesium": "Cesium draws no splats in glTF but SPZ, as levels --tiles writes them",
 }  # fmt: skip

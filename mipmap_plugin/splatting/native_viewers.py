@@ -31,16 +31,27 @@ UNITY = Viewer(
 )  # fmt: skip
 
 BRUSH = Viewer(
-    "brush", "Brush, and LichtFeld Studio",
-    "brush 8b7f5c6c, brush-render, for a file without SplatRenderMode mip; LichtFeld-Studio 0ff1dc2, rendering/cuda/rasterization",
-    "classic", DILATION, RenderSettings(max_alpha=0.999), near_plane=0.01, sh_degree=4,
-    unlike="in Brush a file with SplatRenderMode mip is drawn as mip; LichtFeld Studio draws SH up to degree 3, and newer versions were not read"
-    + UNSEEN,
+    "brush", "Brush", "brush 8b7f5c6c, brush-render, for a file without SplatRenderMode mip", "classic", DILATION,
+    RenderSettings(max_alpha=0.999), near_plane=0.01, sh_degree=4, unlike="a file with SplatRenderMode mip is drawn as mip" + UNSEEN,
 )  # fmt: skip
+
+# LichtFeld Studio's least alpha, at which an opaque splat ends.
+LICHTFELD_ALPHA = 0.5 / 255
 
 # Those that `portable` leaves out: but for MetalSplatter it suits them without, and with them its start would be that of dilation by 0.3 px² instead
 # of 0.075: the worst viewer of lego at x1/4 would have 3.3 dB less, the mean 2.7 (docs/viewers.md).
 FURTHER = (
+    Viewer(
+        "lichtfeld", "LichtFeld Studio",
+        "LichtFeld-Studio of 2026, rendering/rasterizer/vulkan: config a194d705, vertex_shader 0241ebb7, utils 0232ecb1, alphablend_shader 1cbe0678",
+        "classic", DILATION,
+        RenderSettings(
+            min_alpha=LICHTFELD_ALPHA, max_alpha=0.999, radius=(-2 * math.log(LICHTFELD_ALPHA)) ** 0.5, max_half_axis=512.5, max_color=4.0, frame=1.4,
+        ),
+        near_plane=0.01,
+        unlike="with its mip filter it is Mip-Splatting's; fainter splats may be up to a quarter longer; October 2025 (0ff1dc2) it drew as Brush does"
+        + UNSEEN,
+    ),
     Viewer(
         "vk-gaussian-splatting", "NVIDIA's vk_gaussian_splatting",
         "vk_gaussian_splatting 2026.1.6 (fb89d09), threedgs shaders, dist.comp, parameters.h", "classic", DILATION,

@@ -153,7 +153,7 @@ IN_FILES = re.compile(r"\w[\w.+-]*")
 ALIASES = {
     **dict.fromkeys(("inria", "gsplat", "nerfstudio", "kiri", "3dgs.cpp"), "classic"),
     **dict.fromkeys(("supersplat", "supersplat-viewer"), "playcanvas"),
-    **{"mkkellogg": "gaussian-splats-3d", "threejs": "three", "drei": "aframe", "lichtfeld": "brush", "godot": "gdgs"},
+    **{"mkkellogg": "gaussian-splats-3d", "threejs": "three", "drei": "aframe", "godot": "gdgs"},
 }
 
 # What is asked for, but has no record: why, and what to take instead.
