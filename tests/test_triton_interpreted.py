@@ -104,6 +104,18 @@ def test_a_near_plane_of_0_divides_by_nothing():
     assert not any(grad[:2].any() for grad in grads.values())
 
 
+@pytest.mark.parametrize(("width", "drawn"), [(1e-12, True), (1e-16, False)])
+def test_a_needle_along_y_is_drawn_and_has_gradients_down_to_the_thinnest(width, drawn):
+    """Without dilation, through the middle of a column of pixels: 2.6e-24 px² across, whose square is 0 in float32; then less than is drawn."""
+    view, no_dilation = replace(camera(16, 16, 16.0, 16.0), viewmat=torch.eye(4)), Effects(0, eps2d=0.0)
+    shape = torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.tensor([[width, 1.0, width]])
+    needle = Gaussians(torch.tensor([[0.3125, 0.3125, 10.0]]), *shape, torch.tensor([0.9]), torch.ones(1, 1, 3))
+    image, alpha, grads = triton_result(needle, view, no_dilation)
+    right = draw(ReferenceBackend().render, needle.to(dtype=torch.float64), view, no_dilation)
+    assert_equal((image, alpha, grads if drawn else {}), right)
+    assert (alpha.max() > 0.89) == drawn and all(grad.isfinite().all() and (grad.any() or not drawn) for grad in grads.values())
+
+
 def test_bands_left_out_have_no_gradient():
     grads = triton_result(gaussians(12, 3), camera(16, 16))[2]
     assert grads["sh"][:, :4].any() and not grads["sh"][:, 4:].any()

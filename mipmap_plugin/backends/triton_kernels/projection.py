@@ -12,12 +12,14 @@ from mipmap_plugin.backends.triton_kernels.rounding import round_to
 from mipmap_plugin.backends.triton_kernels.shapes import from_axes, from_covariance, load_quat
 from mipmap_plugin.backends.triton_kernels.vectors import LARGEST, finite, load3
 from mipmap_plugin.backends.triton_kernels.views import clamped_slopes, from_eye, image_axis, in_camera
+from mipmap_plugin.splatting import filters
 
 NEAR, EPS2D, MIN_ALPHA, W_END, SH_DEGREE = views.NEAR, views.EPS2D, views.MIN_ALPHA, views.W_END, views.SH_DEGREE
 COMPENSATES, LEAST_COMPENSATION = views.COMPENSATES, views.LEAST_COMPENSATION
 FX, FY, CX, CY = views.FX, views.FY, views.CX, views.CY
 FRAME, RADIAL, MAX_COLOR, COLOR_STEPS, LISTS_CULLED = views.FRAME, views.RADIAL, views.MAX_COLOR, views.COLOR_STEPS, views.LISTS_CULLED
 WIDTH, HEIGHT, TILES_X, TILES_Y, NUMBERS = views.WIDTH, views.HEIGHT, views.TILES_X, views.TILES_Y, views.NUMBERS
+THINNEST = tl.constexpr(filters.THINNEST)
 
 
 @triton.jit
@@ -131,7 +133,7 @@ def project_kernel(
     y = eye[1] / safe * tl.load(view + FY) + tl.load(view + CY)
     all_finite = finite(x) & finite(y) & finite(xx) & finite(xy) & finite(yy) & finite(det_blur) & finite(opacity)
     shear, across, along = xy / yy, det_blur / yy, (-1 / yy) * HALF_LOG2_E
-    drawn = ahead & all_finite & (opacity >= tl.load(view + MIN_ALPHA)) & (across > 0)
+    drawn = ahead & all_finite & (opacity >= tl.load(view + MIN_ALPHA)) & (across > THINNEST)
     if VIEWER:
         drawn &= in_frame(view, x, y) & tl.where(tl.load(view + LISTS_CULLED) > 0, inside, kept)
         along, opacity = tl.where(kept, along, -along), opacity / (1 - tl.load(view + W_END))

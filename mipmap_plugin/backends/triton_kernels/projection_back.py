@@ -20,7 +20,7 @@ FX, FY, NUMBERS = views.FX, views.FY, views.NUMBERS
 def record_back(xy, yy, det, d_along, d_shear, d_across):
     """Gradients of xy, yy and det as drawn from those of a record."""
     across = det / yy
-    d_width = d_across * HALF_LOG2_E / (across * across)
+    d_width = d_across * HALF_LOG2_E / across / across  # the square of a small number would be 0
     return d_shear / yy, (d_along * HALF_LOG2_E / yy - d_shear * xy / yy - d_width * across) / yy, d_width / yy
 
 
