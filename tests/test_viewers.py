@@ -605,6 +605,20 @@ def test_on_the_web_the_projection_is_frozen_nowhere(backend):
     assert frozen[MIDDLE, 20] < rendered[MIDDLE, 20] - 0.01
 
 
+@BOTH
+def test_in_unity_the_width_limits_the_jacobian_along_y_too(backend):
+    """A ball in a tall picture, whose half is 2.1 high and 0.525 wide: at a slope of 1 its variance is that at 1.3 · 0.525, also off center."""
+    sigma, f, tall = 0.3, 20.0, 4 * SIZE
+    for cy in (tall / 2, tall / 2 - 8):
+        view = replace(camera(), height=tall, fx=f, fy=f, cy=cy)
+        shape = torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 3), sigma)
+        ball = Gaussians(torch.tensor([[0.0, 2.0, 2.0]]), *shape, torch.tensor([0.9]), torch.zeros(1, 1, 3))
+        for viewer, slope in (("unity", 1.3 * 0.525), ("brush", 1.0)):
+            variance = (f * sigma / 2) ** 2 * (1 + slope**2) + 0.3
+            rendered = backend.render(ball, view, find_viewer(viewer).effects(Effects(0))).alpha[:, MIDDLE]
+            assert rendered[int(cy + f) + 4].item() == pytest.approx(0.9 * math.exp(-(4.5**2) / variance / 2), abs=1e-5)
+
+
 # Packing
 
 

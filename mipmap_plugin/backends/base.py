@@ -37,6 +37,7 @@ SETTINGS = {
     "fits_picture": "splats no larger than the image",
     "packing": "packing",
     "frozen_beyond": "another limit of the Jacobian",
+    "frozen_by_width": "a limit of the Jacobian by the width",
     "frame": "culling by the center",
     "linear_light": "blending in linear light",
     "picture_step": "rounding after each splat",
@@ -45,7 +46,7 @@ SETTINGS = {
 # Those that screen filters that integrate support; the others depend on a splat's weight at a point.
 WITH_INTEGRALS = frozenset({
     *("min_alpha", "min_transmittance", "radius", "tile", "max_color", "color_steps"),
-    *("radial", "bucketed", "even_buckets", "frozen_beyond", "frame", "packing", "linear_light"),
+    *("radial", "bucketed", "even_buckets", "frozen_beyond", "frozen_by_width", "frame", "packing", "linear_light"),
 })
 
 # Incremented when `Backend.render` or the records below change in a way that breaks existing backends.

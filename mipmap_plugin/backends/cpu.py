@@ -48,7 +48,7 @@ class CpuBackend:
 
     def lacking(self, needs: Needs) -> list[str]:
         """The reasons why this backend cannot serve `needs`; empty if it can."""
-        supported = {"max_color", "color_steps", "radial", "bucketed", "even_buckets", "frozen_beyond", "packing"}
+        supported = {"max_color", "color_steps", "radial", "bucketed", "even_buckets", "frozen_beyond", "frozen_by_width", "packing"}
         changed = needs.screen_filter in INTEGRATED and set(needs.settings.changed()) - supported
         unsupported = [f"it draws the screen filter {needs.screen_filter} with the usual cut-offs only"] if changed else []
         return self.capabilities.lacking(needs) + unsupported or missing()

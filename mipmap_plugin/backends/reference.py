@@ -105,6 +105,6 @@ def least_alpha(footprints: Footprint | PixelIntegral | Surfels, settings: Rende
 def _footprints(gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[Projected, Footprint | PixelIntegral | Surfels]:
     if effects.screen_filter == SURFEL:
         return surfels(gaussians, camera, effects)
-    projected = project(gaussians, camera, effects.near_plane, effects.settings.frozen_beyond)
+    projected = project(gaussians, camera, effects.near_plane, effects.settings)
     most = effects.settings.max_variance(camera.width, camera.height)
     return projected, footprint(projected, gaussians.opacities, effects.screen_filter, effects.eps2d, effects.settings, most)

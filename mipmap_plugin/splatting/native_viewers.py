@@ -25,7 +25,9 @@ GODOT_LEAST = 2 * 0.1**0.5 - DILATION
 
 UNITY = Viewer(
     "unity", "UnityGaussianSplatting (aras-p)", "UnityGaussianSplatting 1.1.1 (2c6fed3), RenderGaussianSplats, GaussianSplatting.hlsl",
-    "classic", DILATION, replace(WEBGL, min_alpha=1 / 255, frozen_beyond=FRUSTUM_MARGIN, picture_step=None),
+    "classic", DILATION,
+    # Along y its limit of the Jacobian is that along x, and both are taken from the axis of view.
+    replace(WEBGL, min_alpha=1 / 255, frozen_beyond=FRUSTUM_MARGIN, frozen_by_width=True, max_half_axis=8192.0, picture_step=None),
     unlike="a splat ends at a square instead of an ellipse, assets are packed at the quality chosen on import, and the background shines "
     "through in linear light" + UNSEEN,
 )  # fmt: skip

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.render_settings import FRUSTUM_MARGIN
-from mipmap_plugin.splatting.camera_tensors import CameraTensors
+from mipmap_plugin.render_settings import USUAL, RenderSettings
+from mipmap_plugin.splatting.camera_tensors import FIRST, HALF, CameraTensors, numbers_of
 from mipmap_plugin.splatting.rotations import rotations
+
+T = TypeVar("T", Tensor, float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +41,7 @@ def axes_of(quats: Tensor, scales: Tensor) -> Tensor:
 
 
 def project(
-    gaussians: Gaussians, camera: Camera | CameraTensors, near: float, frozen_beyond: float = FRUSTUM_MARGIN, axes: Tensor | None = None
+    gaussians: Gaussians, camera: Camera | CameraTensors, near: float, settings: RenderSettings = USUAL, axes: Tensor | None = None
 ) -> Projected:
     """Project splats to the image plane. The values of splats nearer than `near` are finite but meaningless.
 
@@ -51,7 +54,7 @@ def project(
     safe = depths.clamp_min(near)[..., None]
     slopes = in_camera[..., :2] / safe
     means2d = slopes * view.focal + view.middle
-    to_image = _jacobian(slopes, safe, view, frozen_beyond)
+    to_image = _jacobian(slopes, safe, view, settings)
     if gaussians.covariances is not None:
         shapes = _from_covariances(to_image, gaussians.covariances)
     else:
@@ -59,10 +62,25 @@ def project(
     return Projected(means2d, depths, *shapes, to_image)
 
 
-def _jacobian(slopes: Tensor, depths: Tensor, view: CameraTensors, frozen_beyond: float) -> Tensor:
-    """The derivative of the projection at each center, [..., N, 2, 3]; slopes are clamped to the frustum widened by `frozen_beyond` on each side."""
-    left, right = view.first - frozen_beyond * view.half, view.first + (2 + frozen_beyond) * view.half
-    clamped = torch.minimum(torch.maximum(slopes, left), right)
+def slope_limits(camera: Camera, settings: RenderSettings) -> tuple[float, float, float, float]:
+    """The least and the greatest slope along x, and those along y, between which the Jacobian is not frozen."""
+    numbers = numbers_of(camera)
+    (left, right), (top, bottom) = (_limits(numbers[FIRST + k], numbers[HALF + k], numbers[HALF], settings) for k in (0, 1))
+    return left, right, top, bottom
+
+
+def _limits(first: T, half: T, half_width: T, settings: RenderSettings) -> tuple[T, T]:
+    """The least and the greatest slope for a picture that begins at `first` and is twice `half` long."""
+    beyond = settings.frozen_beyond
+    if settings.frozen_by_width:
+        return -(1 + beyond) * half_width, (1 + beyond) * half_width
+    return first - beyond * half, first + (2 + beyond) * half
+
+
+def _jacobian(slopes: Tensor, depths: Tensor, view: CameraTensors, settings: RenderSettings) -> Tensor:
+    """The derivative of the projection at each center, [..., N, 2, 3]; slopes are clamped to their limits."""
+    least, most = _limits(view.first, view.half, view.half[..., :1], settings)
+    clamped = torch.minimum(torch.maximum(slopes, least), most)
     across, ahead = view.rotation[..., None, :2, :], view.rotation[..., None, 2:, :]
     return (view.focal / depths)[..., None] * (across - clamped[..., None] * ahead)
 

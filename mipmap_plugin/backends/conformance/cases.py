@@ -254,7 +254,7 @@ RULES = {
     "spread": RenderSettings(least_spread=3.0),
     "largest-color": RenderSettings(max_color=0.6),
     **{"distance": RenderSettings(radial=True), "linear-light": RenderSettings(linear_light=2.2)},
-    "frame": RenderSettings(frame=0.7, frozen_beyond=math.inf),
+    **{"frame": RenderSettings(frame=0.7, frozen_beyond=math.inf), "frozen-by-width": RenderSettings(frozen_beyond=0.0, frozen_by_width=True)},
     "half-axis": RenderSettings(radius=2.0, max_half_axis=5.0),
     "half-axis-of-the-whole": RenderSettings(radius=2.0, max_half_axis=5.0, boxed=True),
     "picture-size": RenderSettings(radius=20.0, fits_picture=True),

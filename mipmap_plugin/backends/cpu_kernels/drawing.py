@@ -18,6 +18,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.process.pool import empty
 from mipmap_plugin.splatting.filters import LEAST_COMPENSATION, w_end
+from mipmap_plugin.splatting.projection import slope_limits
 
 SAMPLING = {"analytic": OVER_PIXEL, "window": OVER_WINDOW}
 
@@ -182,9 +183,7 @@ def _view_of(camera: Camera, effects: Effects, bands: int, covariances: bool, gr
 
 def _made(camera: Camera, effects: Effects, sh_degree: int, gradients: bool) -> View:
     settings = effects.settings
-    left, right = camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx
-    top, bottom = camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy
-    margin_x, margin_y = settings.frozen_beyond * (left + right) / 2, settings.frozen_beyond * (top + bottom) / 2
+    left, right, top, bottom = slope_limits(camera, settings)
     rotation, translation = camera.viewmat.numpy()[:3, :3], camera.viewmat.numpy()[:3, 3]
     return View(
         rotation=tuple(map(tuple, rotation.tolist())),
@@ -194,10 +193,10 @@ def _made(camera: Camera, effects: Effects, sh_degree: int, gradients: bool) -> 
         fy=float(camera.fy),
         cx=float(camera.cx),
         cy=float(camera.cy),
-        left=-left - margin_x,
-        right=right + margin_x,
-        top=-top - margin_y,
-        bottom=bottom + margin_y,
+        left=left,
+        right=right,
+        top=top,
+        bottom=bottom,
         width=camera.width,
         height=camera.height,
         near_plane=float(effects.near_plane),

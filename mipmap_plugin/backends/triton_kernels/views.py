@@ -16,6 +16,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.splatting import filters
+from mipmap_plugin.splatting.projection import slope_limits
 
 
 class Shot(NamedTuple):
@@ -57,14 +58,11 @@ def _row(camera: Camera, effects: Effects, tile: int, gradients: bool, dtype: to
 
 
 def _of_camera(camera: Camera, effects: Effects, tile: int) -> tuple[float, ...]:
-    margin = effects.settings.frozen_beyond / 2
-    margin_x, margin_y = margin * camera.width / camera.fx, margin * camera.height / camera.fy
     return (
         *camera.viewmat[:3, :3].flatten().tolist(),
         *camera.center.tolist(),
         *(camera.fx, camera.fy, camera.cx, camera.cy),
-        *(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x),
-        *(-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y),
+        *slope_limits(camera, effects.settings),
         *(effects.near_plane, effects.eps2d, filters.LEAST_COMPENSATION[effects.screen_filter] ** 2, effects.settings.min_alpha),
         *(effects.sh_degree, effects.settings.divisible[1]),
         *effects.background,

@@ -84,7 +84,7 @@ class WalkTruth:
         covariances = axes @ axes.mT + torch.einsum("nk,ki,kj->nij", variances, across, across)
         opacities = splats.opacities
         if effects.screen_filter in COMPENSATED:
-            projected = project(splats, fine, effects.near_plane, effects.settings.frozen_beyond)
+            projected = project(splats, fine, effects.near_plane, effects.settings)
             det = projected.det + whole * (projected.xx + projected.yy) + whole**2
             opacities = opacities * (projected.det / det).sqrt()
         return replace(splats, covariances=covariances, opacities=opacities)
