@@ -24,6 +24,9 @@ FRUSTUM_MARGIN = 0.3
 # Kernels divide by what a splat lets through and by what is left behind all splats. These keep both away from 0, and change no picture by 1e-6.
 MOST_OPAQUE, LEAST_LEFT = 1 - 2**-20, 1e-30
 
+# Rounding errors of a quotient that is meant to be whole.
+STEP_TOLERANCE = 1e-6
+
 TILE = 16  # px
 
 
@@ -87,7 +90,7 @@ class RenderSettings:
         max_alpha: Alpha of a splat in a pixel is clamped to this.
         fades: A splat falls to 0 at `radius`: its weight w becomes (w - w_end) / (1 - w_end), where w_end is the weight at `radius`.
         max_color: Limit of a splat's color, in each channel.
-        color_steps: A splat's red, green and blue are rounded to multiples of these.
+        color_steps: A splat's red, green and blue are rounded to multiples of these, which divide `max_color`.
         radial: Splats are sorted by their distance to the eye instead of by depth.
         bucketed: Splats are sorted by PlayCanvas's buckets of depth (`splatting.buckets`).
         even_buckets: Splats are sorted by buckets that are all of one length.
@@ -143,6 +146,10 @@ class RenderSettings:
             raise SettingsError("`radial`, `bucketed` and `even_buckets` are different orders of splats; give only one of them")
         if self.linear_light is not None and not all(value is None for value in (self.max_color, self.color_steps, self.picture_step, self.packing)):
             raise SettingsError("`linear_light` goes with no packing, and with no limit or rounding of colors or of the picture; leave those out")
+        largest = self.max_color or 0.0
+        for step in self.color_steps or ():
+            if abs(largest / step - round(largest / step)) > STEP_TOLERANCE:
+                raise SettingsError(f"max_color must be a multiple of each of color_steps, or colors pass it, got {largest} and {step}")
         if self.radius is None and (self.fits_picture or self.max_half_axis < math.inf):
             raise SettingsError("`max_half_axis` and `fits_picture` need the radius at which a splat ends; give radius, such as 8**0.5")
 

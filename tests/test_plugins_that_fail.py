@@ -329,6 +329,12 @@ def test_render_settings_out_of_range_are_refused(wrong):
         RenderSettings(**wrong)
 
 
+@pytest.mark.parametrize(("largest", "step"), [(1.0, 0.3), (4.0, 0.35), (0.5, 1.0)])
+def test_steps_of_colors_that_pass_their_limit_are_refused(largest, step):
+    with pytest.raises(SettingsError, match=f"max_color must be a multiple of each of color_steps, .* got {largest} and {step}"):
+        RenderSettings(max_color=largest, color_steps=(largest / 4, step, step))
+
+
 @pytest.mark.parametrize(
     "wrong",
     [{"opacity": (0.0,)}, {"color": 0.0}, {"bands": (0.0,)}, {"log_scales": (9.0, -12.0, 0.1)}, {"quats": "smallest"}, {"bands": [0.1]}],
