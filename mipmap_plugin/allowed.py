@@ -44,6 +44,7 @@ OF_SETTINGS: Mapping[str, Rule] = {
     "min_variance": SIZE,
     "min_contribution": SIZE,
     "least_spread": SIZE,
+    "level_below": SIZE,
     "max_half_axis": POSITIVE,
     "frozen_beyond": ANY_SIZE,
     "frame": POSITIVE,

@@ -99,6 +99,7 @@ class RenderSettings:
         min_contribution: px², after dilation: splats whose opacity · sqrt(det) is less are culled.
         rooted: `min_contribution` is compared with sqrt(opacity · det) instead.
         least_spread: px², after dilation: minimum distance of variances from their mean; splats whose smaller one becomes 0 are culled.
+        level_below: px²: those whose |xy| is less are stretched along (1, up) instead of (xy, up) (`splatting.culls`).
         max_half_axis: px, at `radius`: longer half-axes are shortened to this; with `boxed` the whole splat shrinks before.
         fits_picture: Half-axes are also limited to the picture's shorter side.
         packing: Quantization of splats in memory.
@@ -125,6 +126,7 @@ class RenderSettings:
     min_contribution: float = 0.0
     rooted: bool = False
     least_spread: float = 0.0
+    level_below: float = 0.0
     max_half_axis: float = math.inf
     fits_picture: bool = False
     packing: Packing | None = None
@@ -186,7 +188,7 @@ class RenderSettings:
 
     def finer(self, n: float) -> RenderSettings:
         """These settings for an image with n times as many pixels along each axis: areas in px² are scaled by n²."""
-        areas = {name: getattr(self, name) * n**2 for name in ("min_variance", "min_contribution", "least_spread")}
+        areas = {name: getattr(self, name) * n**2 for name in ("min_variance", "min_contribution", "least_spread", "level_below")}
         return replace(self, **areas, max_half_axis=self.max_half_axis * n) if self.culls or self.max_half_axis < math.inf else self
 
 

@@ -198,11 +198,14 @@ def test_gaussian_splats_3d_turns_a_nearly_round_splat(backend):
 
 @BOTH
 def test_programs_that_took_its_eigenvalues_stretch_splats_or_drop_them(backend):
-    """NVIDIA's viewer does both, MetalSplatter stretches less, and Godot's only drops."""
+    """NVIDIA's viewer does both, MetalSplatter stretches less, and Godot's only drops. NVIDIA's stretches level splats along (1, up)."""
     small, a_little_larger, round_one = splat(0.0161, 0.0161), splat(0.0163, 0.0163), splat(1.0, 1.0, 0.8)
     stretched = {"vk-gaussian-splatting": math.sqrt(0.1), "metalsplatter": 0.1, "gdgs": 0.0}
     for viewer, spread in stretched.items():
-        assert alpha(backend, viewer, round_one)[MIDDLE + 2, MIDDLE] == pytest.approx(0.8 * math.exp(-2 / (1.3 + spread)), abs=1e-5)
+        x, y = (1, spread) if viewer == "vk-gaussian-splatting" else (0, 1)
+        along, across = (2 * y) ** 2 / (x * x + y * y), (2 * x) ** 2 / (x * x + y * y)  # of a pixel two below the middle
+        weight = 0.8 * math.exp(-(along / (1.3 + spread) + across / (1.3 - spread)) / 2)
+        assert alpha(backend, viewer, round_one)[MIDDLE + 2, MIDDLE] == pytest.approx(weight, abs=1e-5)
         assert (alpha(backend, viewer, small).max() == 0) == (viewer != "metalsplatter")
     assert alpha(backend, "vk-gaussian-splatting", a_little_larger).max() > 0
     assert alpha(backend, "gdgs", splat(0.0326, 1e-6)).max() > 0  # a needle of that mean

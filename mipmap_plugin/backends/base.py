@@ -33,6 +33,7 @@ SETTINGS = {
     "min_contribution": "culling by contribution",
     "rooted": "culling by the root of opacity · det",
     "least_spread": "stretching of round splats",
+    "level_below": "level stretching",
     "max_half_axis": "a largest splat",
     "fits_picture": "splats no larger than the image",
     "packing": "packing",

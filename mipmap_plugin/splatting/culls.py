@@ -47,17 +47,20 @@ def spread(shape: tuple[Tensor, Tensor, Tensor, Tensor]) -> Tensor:
     return torch.where(is_round, 0.0, torch.hypot(torch.where(is_round, 1.0, half), xy))
 
 
-def stretched(shape: tuple[Tensor, Tensor, Tensor, Tensor], drawn: Tensor, least: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def stretched(
+    shape: tuple[Tensor, Tensor, Tensor, Tensor], drawn: Tensor, least: float, level: float = 0.0
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Stretch the `drawn` [N] splats whose `spread` is below `least` px² until it is `least`.
 
     As in GaussianSplats3D (SplatMaterial3D): the direction of the longer axis is (xy, mean + least - xx), which is an eigenvector
-    only where the variances do not change. A round splat becomes elongated along y.
+    only where the variances do not change. A round splat becomes elongated along y. vk_gaussian_splatting (threedgs) has 1 in place of an
+    xy between ±`level`.
     """
     xx, xy, yy, _ = shape
     mean, half = (xx + yy) / 2, (xx - yy) / 2
     changed = drawn & (spread(shape) < least)
     # `where` before the squares as well as after: those of the others may overflow, and infinity times zero is NaN.
-    up, xy = torch.where(changed, least - half, 1.0), torch.where(changed, xy, 0.0)
+    up, xy = torch.where(changed, least - half, 1.0), torch.where(changed, torch.where(xy.abs() < level, 1.0, xy), 0.0)
     squared = xy.square() + up.square()
     cos, sin = least * (xy.square() - up.square()) / squared, least * 2 * xy * up / squared
     stretch = mean + cos, sin, mean - cos, mean.square() - least**2

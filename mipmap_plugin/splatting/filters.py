@@ -102,7 +102,7 @@ def footprint(
     if compensates(screen_filter):
         opacities = opacities * (projected.det / det).clamp_min(LEAST_COMPENSATION[screen_filter] ** 2).sqrt()
     if settings.least_spread and gate is not None:
-        shape = culls.stretched(shape, gate > 0.5, settings.least_spread)
+        shape = culls.stretched(shape, gate > 0.5, settings.least_spread, settings.level_below)
     if max_variance < math.inf:
         shape = culls.limited(shape, max_variance, settings.boxed)
     xx, xy, yy, det = shape

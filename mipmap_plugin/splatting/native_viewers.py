@@ -59,11 +59,11 @@ FURTHER = (
         "vk_gaussian_splatting 2026.1.6 (fb89d09), threedgs shaders, dist.comp, parameters.h", "classic", DILATION,
         # 16 bits a channel, from the back; SH coefficients within -1..1 in 255 steps.
         replace(
-            WEBGL, min_alpha=1 / 255, frame=1.2, max_half_axis=2048.0, least_spread=0.1**0.5, packing=Packing(color=1 / 255, bands=(2 / 255,) * 3),
-            picture_step=None,
+            WEBGL, min_alpha=1 / 255, frame=1.2, max_half_axis=2048.0, least_spread=0.1**0.5, level_below=1e-3,
+            packing=Packing(color=1 / 255, bands=(2 / 255,) * 3), picture_step=None,
         ),
         unlike="as its rasterizer of 3DGS draws with the settings that it starts with, not 3DGUT or ray tracing; with mip-splatting antialiasing it "
-        "compensates" + UNSEEN,
+        "compensates; upright splats that are not stretched are turned, too, where |xy| is below 0.001 px²" + UNSEEN,
     ),
     Viewer(
         # The minimum distance of variances from their mean is 0.1 here, where GaussianSplats3D has its root.

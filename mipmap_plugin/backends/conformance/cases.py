@@ -251,7 +251,7 @@ RULES = {
     "size": RenderSettings(min_variance=4.0),
     "size-along-x-and-y": RenderSettings(min_variance=4.0, boxed=True),
     "contribution": RenderSettings(min_contribution=1.5),
-    "spread": RenderSettings(least_spread=3.0),
+    **{"spread": RenderSettings(least_spread=3.0), "level-spread": RenderSettings(least_spread=3.0, level_below=1.0)},
     "largest-color": RenderSettings(max_color=0.6),
     **{"distance": RenderSettings(radial=True), "linear-light": RenderSettings(linear_light=2.2)},
     **{"frame": RenderSettings(frame=0.7, frozen_beyond=math.inf), "frozen-by-width": RenderSettings(frozen_beyond=0.0, frozen_by_width=True)},

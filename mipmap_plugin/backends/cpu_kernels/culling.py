@@ -85,27 +85,29 @@ def stretched(view, shape, drawn):
     xx, xy, yy, det = shape
     least_spread, mean, half = view.least_spread, 0.5 * (xx + yy), 0.5 * (xx - yy)
     changed = both(drawn, half * half + xy * xy < least_spread * least_spread)
-    up = least_spread - half
-    per_squared = least_spread / select(changed, xy * xy + up * up, 1.0)
-    cos, sin = (xy * xy - up * up) * per_squared, 2 * xy * up * per_squared
+    up, aside = least_spread - half, select(maximum(xy, 0 - xy) < view.level_below, 1.0, xy)
+    per_squared = least_spread / select(changed, aside * aside + up * up, 1.0)
+    cos, sin = (aside * aside - up * up) * per_squared, 2 * aside * up * per_squared
     new = mean * mean - least_spread * least_spread
     return (select(changed, mean + cos, xx), select(changed, sin, xy), select(changed, mean - cos, yy), select(changed, new, det)), changed
 
 
 @inner
 def grad_stretched(view, shape, changed, d_shape):
-    """The gradient of a shape before `stretched`, through its mean and the angle of (xy, up); (cos, sin) have twice that angle."""
+    """The gradient of a shape before `stretched`, through its mean and the angle of (aside, up); (cos, sin) have twice that angle."""
     xx, xy, yy, _ = shape
     d_xx, d_xy, d_yy, d_det = d_shape
     least_spread, mean, up = view.least_spread, 0.5 * (xx + yy), view.least_spread - 0.5 * (xx - yy)
-    per_squared = 1 / select(changed, xy * xy + up * up, 1.0)
-    cos, sin = (xy * xy - up * up) * per_squared, 2 * xy * up * per_squared
+    level = maximum(xy, 0 - xy) < view.level_below
+    aside = select(level, 1.0, xy)
+    per_squared = 1 / select(changed, aside * aside + up * up, 1.0)
+    cos, sin = (aside * aside - up * up) * per_squared, 2 * aside * up * per_squared
     d_mean = d_xx + d_yy + 2 * mean * d_det
     d_angle = 2 * least_spread * (cos * d_xy - sin * (d_xx - d_yy)) * per_squared
-    d_half = 0 - d_angle * xy  # d up / d half is -1
+    d_half = 0 - d_angle * aside  # d up / d half is -1
     return (
         select(changed, 0.5 * (d_mean + d_half), d_xx),
-        select(changed, 0 - d_angle * up, d_xy),
+        select(changed, select(level, 0.0, 0 - d_angle * up), d_xy),
         select(changed, 0.5 * (d_mean - d_half), d_yy),
         select(changed, 0.0, d_det),
     )

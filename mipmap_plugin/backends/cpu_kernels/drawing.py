@@ -217,6 +217,7 @@ def _made(camera: Camera, effects: Effects, sh_degree: int, gradients: bool) -> 
         min_contribution=float(settings.min_contribution),
         rooted=settings.rooted,
         least_spread=float(settings.least_spread),
+        level_below=float(settings.level_below),
         max_variance=settings.max_variance(camera.width, camera.height),
         lists_culled=gradients,
     )

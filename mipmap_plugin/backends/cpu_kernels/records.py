@@ -56,6 +56,7 @@ class View(NamedTuple):
     min_contribution: float  # px²
     rooted: bool
     least_spread: float  # px²
+    level_below: float  # px²
     max_variance: float  # px²; infinite: no limit
     lists_culled: bool  # whether the lists of tiles contain culled splats, for their gradient
 

@@ -13,6 +13,7 @@ from mipmap_plugin.backends.triton_kernels.vectors import LARGEST
 from mipmap_plugin.splatting import culls
 
 MIN_VARIANCE, MIN_CONTRIBUTION, LEAST_SPREAD, MAX_VARIANCE = views.MIN_VARIANCE, views.MIN_CONTRIBUTION, views.LEAST_SPREAD, views.MAX_VARIANCE
+LEVEL_BELOW = views.LEVEL_BELOW
 BOXED, ROOTED = views.BOXED, views.ROOTED
 
 STEEPNESS = tl.constexpr(culls.STEEPNESS)
@@ -74,19 +75,19 @@ def gate_back(view, xx, xy, yy, det, opacity, d_gate):
 
 @triton.jit
 def turned(view, xx, xy, yy, drawn):
-    """Which drawn splats have a spread below the least; `up`, the cosine and sine of twice the angle of (xy, up), and 1 / (xy² + up²)."""
+    """Which drawn splats have a spread below the least; the vector (aside, up), the cosine and sine of twice its angle, and 1 / its square."""
     least, spread = tl.load(view + LEAST_SPREAD), spread_of(xx, xy, yy)
     changed = drawn & (spread < least)
-    up = least - 0.5 * (xx - yy)
-    per_squared = 1 / tl.where(changed, xy * xy + up * up, 1.0)
-    return changed, up, (xy * xy - up * up) * per_squared, 2 * xy * up * per_squared, per_squared
+    aside, up = tl.where(tl.abs(xy) < tl.load(view + LEVEL_BELOW), 1.0, xy), least - 0.5 * (xx - yy)
+    per_squared = 1 / tl.where(changed, aside * aside + up * up, 1.0)
+    return changed, aside, up, (aside * aside - up * up) * per_squared, 2 * aside * up * per_squared, per_squared
 
 
 @triton.jit
 def stretched(view, xx, xy, yy, det, drawn):
     """The shapes, with drawn splats stretched whose spread is below the least."""
     least, mean = tl.load(view + LEAST_SPREAD), 0.5 * (xx + yy)
-    changed, _up, cos, sin, _per_squared = turned(view, xx, xy, yy, drawn)
+    changed, _aside, _up, cos, sin, _per_squared = turned(view, xx, xy, yy, drawn)
     cos, sin = least * cos, least * sin
     new = (mean - least) * (mean + least)
     return tl.where(changed, mean + cos, xx), tl.where(changed, sin, xy), tl.where(changed, mean - cos, yy), tl.where(changed, new, det)
@@ -94,14 +95,15 @@ def stretched(view, xx, xy, yy, det, drawn):
 
 @triton.jit
 def stretched_back(view, xx, xy, yy, drawn, d_xx, d_xy, d_yy, d_det):
-    """The gradient of a shape before `stretched`, through its mean and the angle of (xy, up)."""
+    """The gradient of a shape before `stretched`, through its mean and the angle of (aside, up)."""
     least = tl.load(view + LEAST_SPREAD)
-    changed, up, cos, sin, per_squared = turned(view, xx, xy, yy, drawn)
+    changed, aside, up, cos, sin, per_squared = turned(view, xx, xy, yy, drawn)
     d_mean = d_xx + d_yy + (xx + yy) * d_det
     d_angle = 2 * least * (cos * d_xy - sin * (d_xx - d_yy)) * per_squared
-    d_half = -d_angle * xy  # d up / d half is -1
+    d_half = -d_angle * aside  # d up / d half is -1
+    d_aside = tl.where(tl.abs(xy) < tl.load(view + LEVEL_BELOW), 0.0, -d_angle * up)
     d_xx, d_yy = tl.where(changed, 0.5 * (d_mean + d_half), d_xx), tl.where(changed, 0.5 * (d_mean - d_half), d_yy)
-    return d_xx, tl.where(changed, -d_angle * up, d_xy), d_yy, tl.where(changed, 0.0, d_det)
+    return d_xx, tl.where(changed, d_aside, d_xy), d_yy, tl.where(changed, 0.0, d_det)
 
 
 @triton.jit

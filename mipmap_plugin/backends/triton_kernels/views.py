@@ -41,8 +41,8 @@ MAX_ALPHA, FRAME, MAX_COLOR, COLOR_STEPS = tl.constexpr(34), tl.constexpr(35), t
 W_END, LOG2_W_CUT = tl.constexpr(40), tl.constexpr(41)  # weights where splats have faded to 0, and where they are cut off, here -infinity if not
 RADIAL, BOXED, ROOTED, LISTS_CULLED = tl.constexpr(42), tl.constexpr(43), tl.constexpr(44), tl.constexpr(45)  # 1 or 0
 MIN_VARIANCE, MIN_CONTRIBUTION, LEAST_SPREAD = tl.constexpr(46), tl.constexpr(47), tl.constexpr(48)
-MAX_VARIANCE, PICTURE_STEP = tl.constexpr(49), tl.constexpr(50)
-NUMBERS = tl.constexpr(51)  # of each view
+MAX_VARIANCE, PICTURE_STEP, LEVEL_BELOW = tl.constexpr(49), tl.constexpr(50), tl.constexpr(51)
+NUMBERS = tl.constexpr(52)  # of each view
 
 
 def view_parameters(shots: Sequence[Shot], tile: int, gradients: bool, like: Tensor) -> Tensor:
@@ -79,7 +79,7 @@ def _of_settings(camera: Camera, settings: RenderSettings, gradients: bool) -> t
         *(filters.w_end(settings), -(settings.radius**2) / 2 / math.log(2) if is_cut else -math.inf),
         *(float(settings.radial), float(settings.boxed), float(settings.rooted), float(gradients)),
         *(settings.min_variance, settings.min_contribution, settings.least_spread),
-        *(settings.max_variance(camera.width, camera.height), settings.picture_step or 0.0),
+        *(settings.max_variance(camera.width, camera.height), settings.picture_step or 0.0, settings.level_below),
     )
 
 
