@@ -498,7 +498,7 @@ def test_babylon_limits_colors_to_those_of_the_frame_buffer(backend):
 def test_a_viewer_without_a_record_is_refused_with_what_to_take_instead():
     with pytest.raises(SettingsError, match=r"^viewer polycam: .*take portable"):
         find_viewer("polycam")
-    assert find_viewer("nerfstudio") is find_viewer("classic")
+    assert find_viewer("nerfstudio") is find_viewer("gsplat") and find_viewer("inria") is find_viewer("classic")
 
 
 def test_the_order_is_one_or_the_other():
@@ -606,6 +606,14 @@ def test_on_the_web_the_projection_is_frozen_nowhere(backend):
         assert rendered[MIDDLE, 20].item() == pytest.approx(0.9 * math.exp(-(dx**2) / variance / 2), abs=1e-5)
     frozen = backend.render(ball, near, Effects(0, eps2d=0.0)).alpha
     assert frozen[MIDDLE, 20] < rendered[MIDDLE, 20] - 0.01
+
+
+@BOTH
+def test_gsplat_draws_splats_that_are_nearer_than_inria_draws_them(backend):
+    """The limits of the two projects; splats so near fill the picture."""
+    for depth, by_gsplat, by_inria in ((0.005, False, False), (0.1, True, False), (0.3, True, True)):
+        drawn = [bool(alpha(backend, viewer, splat(4.0, 4.0, means=(0.0, 0.0, depth))).max() > 0) for viewer in ("gsplat", "classic")]
+        assert drawn == [by_gsplat, by_inria]
 
 
 @BOTH

@@ -44,6 +44,10 @@ LICHTFELD_ALPHA = 0.5 / 255
 # of 0.075: the worst viewer of lego at x1/4 would have 3.3 dB less, the mean 2.7 (docs/viewers.md).
 FURTHER = (
     Viewer(
+        "gsplat", "gsplat, nerfstudio", "gsplat 1.6.0 (90d7b4b), gsplat_viewer, Common.h; nerfstudio, splatfacto", "classic", DILATION,
+        near_plane=0.01, unlike="a splat ends at 3.33 standard deviations; until gsplat 1.5 its largest alpha was 0.999",
+    ),
+    Viewer(
         "lichtfeld", "LichtFeld Studio",
         "LichtFeld-Studio of 2026, rendering/rasterizer/vulkan: config a194d705, vertex_shader 0241ebb7, utils 0232ecb1, alphablend_shader 1cbe0678",
         "classic", DILATION,

@@ -42,7 +42,7 @@ PLAYCANVAS = replace(
     packing=Packing(log_scales=(-12 + 21 / 255, 9.0, 21 / 255), quats="stereographic"),
 )
 PLAYCANVAS_SOURCE = "playcanvas 2.23.3, gsplatCorner, gsplat and containerCompactWrite shaders (SuperSplat, supersplat-viewer 1.36)"
-INRIA_UNLIKE = "INRIA ends a splat at three standard deviations, rounded up to tiles; gsplat at 3.33, and its largest alpha may be 0.999"
+INRIA_UNLIKE = "INRIA ends a splat at three standard deviations, rounded up to tiles; gsplat at 3.33, and it draws from a depth of 0.01 on"
 
 # RGBA of 8 bits, colors of SH degree 0 within 0..1.
 EIGHT_BITS = Packing(color=1 / 255)
@@ -54,7 +54,7 @@ FRONT_TO_BACK = "covariances are stored in float16, quaternions in 8 bits, and t
 
 BUILT_IN = (
     Viewer(
-        "classic", "3DGS: INRIA's viewer, gsplat, nerfstudio", "diff-gaussian-rasterization; gsplat 1.5, rasterize_mode classic; 3DGS.cpp f614d66",
+        "classic", "3DGS: INRIA's viewer", "diff-gaussian-rasterization; 3DGS.cpp f614d66",
         "classic", DILATION, near_plane=NEAR_PLANE, unlike=INRIA_UNLIKE,
     ),
     Viewer(
@@ -151,9 +151,9 @@ BUILT_IN = (
 IN_FILES = re.compile(r"\w[\w.+-]*")
 
 ALIASES = {
-    **dict.fromkeys(("inria", "gsplat", "nerfstudio", "kiri", "3dgs.cpp"), "classic"),
+    **dict.fromkeys(("inria", "kiri", "3dgs.cpp"), "classic"),
     **dict.fromkeys(("supersplat", "supersplat-viewer"), "playcanvas"),
-    **{"mkkellogg": "gaussian-splats-3d", "threejs": "three", "drei": "aframe", "godot": "gdgs"},
+    **{"mkkellogg": "gaussian-splats-3d", "threejs": "three", "drei": "aframe", "nerfstudio": "gsplat", "godot": "gdgs"},
 }
 
 # What is asked for, but has no record: why, and what to take instead.
