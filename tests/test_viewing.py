@@ -3,9 +3,11 @@
 import hashlib
 import json
 import math
+import socket
 import sys
 import threading
 import time
+import warnings
 from dataclasses import replace
 from itertools import pairwise
 from unittest.mock import MagicMock
@@ -33,7 +35,7 @@ from mipmap_plugin.viewing.controls import MARKS, STOPS, figures, words
 from mipmap_plugin.viewing.pace import COARSEST, MOVING_S, Pace
 from mipmap_plugin.viewing.page import Page, PageSettings
 from mipmap_plugin.viewing.screen import LARGEST_FOV, Sampling, by_distance, by_lens, inside, pose_of, up_of, zoomed
-from mipmap_plugin.viewing.server import NO_VISER, check_address
+from mipmap_plugin.viewing.server import NO_VISER, check_address, served, without_words
 from mipmap_plugin.viewing.sources import File, Levels, Request, Supersampled, of_adapted, open_source
 from mipmap_plugin.viewing.stage import AMPLIFIED, Look, Stage
 
@@ -499,6 +501,15 @@ def test_a_run_is_told_from_its_beginning_to_its_end(base):
 # The command
 
 
+@pytest.fixture(scope="module")
+def server():
+    pytest.importorskip("viser", reason="viser is not installed")
+    server = served("127.0.0.1", 0)
+    yield server
+    with without_words():
+        server.stop()
+
+
 def test_without_viser_the_command_says_what_to_install(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "viser", None)
     assert main(["view", str(tiny.ply(tmp_path / "base.ply")), "--no-browser"]) == 2
@@ -529,6 +540,26 @@ def test_an_address_that_cannot_be_served_is_told():
     with pytest.raises(SettingsError, match="nothing can be served at"):
         check_address("192.0.2.1", 8080)  # an address for documentation, which no machine has
     check_address("127.0.0.1", 0)
+
+
+@pytest.mark.parametrize(("page", "host", "taken"), [
+    (None, "", True),  # no browser
+    ("http://127.0.0.1:{port}", "", True),
+    ("http://localhost:{port}", "localhost:{port}", True),  # through ssh -L
+    ("https://scenes.example", "scenes.example", True),  # behind a proxy
+    ("http://evil.example", "", False),
+    ("http://127.0.0.1:1", "", False),
+    ("null", "", False),  # a file
+])  # fmt: skip
+def test_only_its_own_page_sees_the_scene(server, page, host, taken):
+    """A browser lets every page talk to this machine, and says which one does."""
+    headers = ["Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA=="]
+    headers += ["Host: " + (host or "127.0.0.1:{port}"), *([] if page is None else [f"Origin: {page}"])]
+    port = server.get_port()
+    with warnings.catch_warnings(), socket.create_connection(("127.0.0.1", port)) as connection:
+        warnings.simplefilter("ignore")  # it is told, in the thread of the server
+        connection.sendall("\r\n".join(["GET / HTTP/1.1", *headers, "", ""]).format(port=port).encode())
+        assert connection.recv(99).split()[1] == (b"101" if taken else b"403")
 
 
 def test_what_is_saved_takes_a_free_name(tmp_path):
