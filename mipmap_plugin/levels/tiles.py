@@ -13,6 +13,7 @@ from __future__ import annotations
 import gzip
 import shutil
 import struct
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -72,9 +73,10 @@ def tileset(manifest: dict[str, Any], box: list[float]) -> dict[str, Any]:
     return {"asset": {"version": "1.1"}, **said, "geometricError": farthest, "root": tile}
 
 
-def bounding_box(model: SplatModel) -> list[float]:
-    """The box around all splats as 3D Tiles write it: its center, then half of each of its three axes."""
-    low, high = _bounds(model, REACH)
+def bounding_box(levels: Iterable[SplatModel]) -> list[float]:
+    """The box around all splats of all levels (merged ones reach farther), as 3D Tiles write it: its center, then half of each of its axes."""
+    lows, highs = zip(*(_bounds(model, REACH) for model in levels), strict=True)
+    low, high = torch.stack(lows).amin(dim=0), torch.stack(highs).amax(dim=0)
     center, half = (each[list(AXES)] for each in ((low + high) / -2, (high - low) / 2))
     return [*center.tolist(), *torch.diag(half).flatten().tolist()]
 
@@ -120,7 +122,7 @@ def write_tiles(folder: Path, *, overwrite: bool = False) -> Path:
     Raises SettingsError without splat-transform, OutputExists, OutputError.
     """
     manifest = read_manifest(folder)
-    box = bounding_box(load_model(folder / manifest["levels"][0]["file"]))
+    box = bounding_box(load_model(folder / level["file"]) for level in manifest["levels"])
     with new_folder(folder / TILES, overwrite) as temporary:
         for number, level in enumerate(manifest["levels"]):
             write_tile(folder / level["file"], temporary / f"level_{number}.glb")
