@@ -32,6 +32,7 @@ from mipmap_plugin.levels.exported import readable
 from mipmap_plugin.levels.manifest import read_manifest
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.models.outputs import refuse_far
 
 TILES, TILESET = "tiles", "tileset.json"
 
@@ -75,26 +76,26 @@ def tileset(manifest: dict[str, Any], box: list[float]) -> dict[str, Any]:
 
 def bounding_box(levels: Iterable[SplatModel]) -> list[float]:
     """The box around all splats of all levels (merged ones reach farther), as 3D Tiles write it: its center, then half of each of its axes."""
-    lows, highs = zip(*(_bounds(model, REACH) for model in levels), strict=True)
+    lows, highs = zip(*(_bounds(model) for model in levels), strict=True)
     low, high = torch.stack(lows).amin(dim=0), torch.stack(highs).amax(dim=0)
     center, half = (each[list(AXES)] for each in ((low + high) / -2, (high - low) / 2))
     return [*center.tolist(), *torch.diag(half).flatten().tolist()]
 
 
-def _bounds(model: SplatModel, reach: float) -> tuple[Tensor, Tensor]:
-    """The least and the greatest coordinates of all splats, [3] each, `reach` standard deviations beyond their centers."""
+def _bounds(model: SplatModel) -> tuple[Tensor, Tensor]:
+    """The least and the greatest coordinates of all splats, [3] each."""
     splats = model.gaussians(ONE_PIXEL).detach()
-    beyond: Tensor = reach * splats.scales.max(dim=1).values[:, None]
+    beyond: Tensor = REACH * splats.scales.max(dim=1).values[:, None]
     return (splats.means - beyond).amin(dim=0), (splats.means + beyond).amax(dim=0)
 
 
 def write_tile(ply: Path, tile: Path) -> None:
-    """Write a GLB of the splats of a PLY. Raises SettingsError without splat-transform, OutputError."""
-    compressed = tile.with_suffix(".spz")
+    """Write a GLB of the splats of a PLY. Raises SettingsError without splat-transform and for splats too far away, OutputError."""
+    compressed, means = tile.with_suffix(".spz"), load_model(ply).parameters()["means"].detach()
+    refuse_far(tile, means, "open the level itself")
     with TemporaryDirectory(prefix=TEMPORARY) as folder:
         write_exchange(compressed, partial(shutil.copyfile, readable(ply, Path(folder, ply.name))), overwrite=False)
-    low, high = _bounds(load_model(ply), 0.0)
-    tile.write_bytes(glb(compressed.read_bytes(), low.tolist(), high.tolist()))
+    tile.write_bytes(glb(compressed.read_bytes(), means.amin(dim=0).tolist(), means.amax(dim=0).tolist()))
     compressed.unlink()
 
 
