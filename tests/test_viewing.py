@@ -616,6 +616,16 @@ def test_only_its_own_page_sees_the_scene(server, page, host, taken):
         assert connection.recv(99).split()[1] == (b"101" if taken else b"403")
 
 
+def test_a_browser_that_is_closed_while_its_picture_is_drawn_is_nothing_to_warn_of(monkeypatch):
+    pytest.importorskip("websockets", reason="viser is not installed")
+    monkeypatch.setitem(sys.modules, "viser", MagicMock())
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        served("127.0.0.1", 0)
+        warnings.warn("Queued a BackgroundImageMessage on a closed connection (e.g. ...); it will never be delivered.", stacklevel=1)
+    assert told == []
+
+
 def test_what_is_saved_takes_a_free_name(tmp_path):
     (tmp_path / "bicycle").mkdir()
     free = _free(tmp_path / "bicycle", None)

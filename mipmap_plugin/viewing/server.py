@@ -16,6 +16,9 @@ from mipmap_plugin.errors import SettingsError, install
 # Where a proxy stands between, its user has to know what is wrong, as the page only waits.
 FOREIGN = "a page of {origin} asked for this one's pictures, and got none; if it is this one behind a proxy, let it pass on Host or X-Forwarded-Host"
 
+# viser warns, in our name, of a picture for a browser that was closed while it was drawn.
+CLOSED = "Queued a .* on a closed connection"
+
 NO_VISER = f"the live view needs viser; {install('view')}"
 
 
@@ -26,6 +29,7 @@ def served(host: str, port: int) -> Any:
     except ImportError as error:
         raise SettingsError(NO_VISER) from error
     check_address(host, port)
+    warnings.filterwarnings("ignore", message=CLOSED)
     with without_words(), _own_pages_only():
         return viser.ViserServer(host=host, port=port, verbose=False)
 
