@@ -30,6 +30,7 @@ from mipmap_plugin.models.base import why_no_viewer
 from mipmap_plugin.splatting.viewers import find_viewer
 from mipmap_plugin.viewing import adapting
 from mipmap_plugin.viewing import page as live_page
+from mipmap_plugin.viewing import server as viewing_server
 from mipmap_plugin.viewing.adapting import Adapter, Live, Progress, Wish
 from mipmap_plugin.viewing.around import BASE_PIXELS, NEAR, PIXELS, views_for_screen
 from mipmap_plugin.viewing.controls import MARKS, STOPS, figures, words
@@ -610,10 +611,12 @@ def test_only_its_own_page_sees_the_scene(server, page, host, taken):
     headers = ["Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA=="]
     headers += ["Host: " + (host or "127.0.0.1:{port}"), *([] if page is None else [f"Origin: {page}"])]
     port = server.get_port()
-    with warnings.catch_warnings(), socket.create_connection(("127.0.0.1", port)) as connection:
-        warnings.simplefilter("ignore")  # it is told, in the thread of the server
+    with warnings.catch_warnings(record=True) as told, socket.create_connection(("127.0.0.1", port)) as connection:
+        warnings.simplefilter("always")
         connection.sendall("\r\n".join(["GET / HTTP/1.1", *headers, "", ""]).format(port=port).encode())
         assert connection.recv(99).split()[1] == (b"101" if taken else b"403")
+    ours = [str(each.message) for each in told if each.filename == viewing_server.__file__]
+    assert len(ours) == (not taken) and all(f"a page of '{page}' asked".format(port=port) in each for each in ours)
 
 
 def test_a_browser_that_is_closed_while_its_picture_is_drawn_is_nothing_to_warn_of(monkeypatch):

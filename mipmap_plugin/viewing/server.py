@@ -46,7 +46,7 @@ def _own_pages_only() -> Iterator[None]:
         def answer(connection: Any, request: Any) -> Any:
             if not foreign_page(request.headers):
                 return process_request(connection, request)
-            warnings.warn(FOREIGN.format(origin=ascii(request.headers["Origin"])), stacklevel=2)
+            warnings.warn(FOREIGN.format(origin=ascii(request.headers["Origin"])), stacklevel=1)  # ours, as the command hides others
             return connection.respond(HTTPStatus.FORBIDDEN, "this page is not that of the live view\n")
 
         return serve(*args, process_request=answer, **options)
