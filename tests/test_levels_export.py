@@ -129,6 +129,19 @@ def test_levels_by_distance_are_shown_at_the_distances_that_they_were_made_for()
     assert (settings["lodBaseDistance"], settings["lodMultiplier"]) == (6.0, 1.7)
 
 
+def test_what_playcanvas_takes_for_levels_by_distance_of_a_scene_in_small_units_is_what_is_written():
+    made = LADDER | {"by": "distance", "lodBaseDistance": 0.05, "lodMultiplier": 1.19, "canvas": 1000}
+    settings = viewer_settings(made | {"base_pixel": 0.01 * 0.05 / distances(LADDER, 1000)[0]}, CHUNKS, 1000)
+    assert (settings["lodBaseDistance"], settings["lodMultiplier"]) == (0.1, 1.2)
+    assert settings["zooms"][0] < 0.7  # and not where they were made for
+
+
+def test_of_a_scene_too_small_for_playcanvas_the_command_says_so(ladder, tool):
+    write_json(ladder / MANIFEST, LADDER | {"base_pixel": 1e-5}, overwrite=True)
+    with pytest.warns(UserWarning, match="no level nearer than 0.1 units, and level 0 should end at 0.017: .* enlarge the scene"):
+        write_streamed(ladder, 1000)
+
+
 def test_chunks_of_a_scene_in_small_units_have_an_extent(ladder, tool):
     write_json(ladder / MANIFEST, LADDER | {"base_pixel": 0.001}, overwrite=True)
     assert EXTENT * distances(LADDER | {"base_pixel": 0.001}, 1000)[0] < 0.5
