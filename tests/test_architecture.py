@@ -63,6 +63,7 @@ CONFINED = {
     "tyro": ["cli.py", "commands/"],
     "typing_extensions": ["frozen_base.py", "wrap.py"],
     "viser": ["viewing/server.py"],
+    "websockets": ["viewing/server.py"],
 }
 
 MAX_FILE, MAX_FUNCTION = 300, 60  # lines

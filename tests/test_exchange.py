@@ -30,6 +30,7 @@ from mipmap_plugin.models import detect, load_model
 from mipmap_plugin.models.adapted_name import adapted_name
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting.harmonics import basis
 from mipmap_plugin.splatting.projection import axes_of
 from mipmap_plugin.wrap import wrap_model
@@ -283,6 +284,34 @@ def test_what_no_viewer_of_it_shows_is_not_written(tmp_path, tool, monkeypatch):
     monkeypatch.setenv("PATH", "")
     with pytest.raises(SettingsError, match="npm install"):
         tiny.model().save(tmp_path / "out.spz", provenance={})
+
+
+def moved_by(offset):
+    splats = tiny.gaussians()
+    return VanillaModel.from_gaussians(replace(splats, means=splats.means + splats.means.new_tensor([0.0, 0.0, offset])))
+
+
+def test_spz_is_not_written_of_splats_that_are_too_far_away_for_it(tmp_path, tool):
+    """Their coordinates would begin anew after 2,048 units, at -2,048."""
+    far = moved_by(-2060.0)
+    refused = r"60 of 60 splats lie 2,048 or more units from the origin along an axis, .*; move or shrink the scene, or give a .sog or a .ply"
+    with pytest.raises(SettingsError, match=refused):
+        far.save(tmp_path / "out.spz", provenance={})
+    with pytest.raises(SettingsError, match=refused):  # before any work
+        wrap_model(far, cameras=tiny.cameras(2)).refuse_output(tmp_path / "out.spz", overwrite=False)
+    far.save(tmp_path / "out.ply", provenance={})
+    with pytest.raises(SettingsError, match="move or shrink the scene, or open the level itself"):
+        write_tile(tmp_path / "out.ply", tmp_path / "out.glb")
+    assert not (tmp_path / "out.glb").exists()
+    far.save(tmp_path / "out.compressed.ply", provenance={})
+    moved_by(2000.0).save(tmp_path / "out.spz", provenance={})
+
+
+def test_levels_in_tiles_are_refused_of_such_splats_before_any_work(tmp_path, tool, capsys, monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.levels.ladder.make_levels", None)
+    moved_by(5e5).save(tmp_path / "city.ply", provenance={})
+    assert main(["levels", str(tmp_path / "city.ply"), "--viewer", "cesium", "--output", str(tmp_path / "ladder"), "--tiles"]) == 2
+    assert "60 of 60 splats lie 2,048 or more units" in (told := capsys.readouterr().err) and "leave --tiles out" in told
 
 
 def test_a_streamed_sog_is_recognized_too(tmp_path):

@@ -6,6 +6,7 @@ import math
 import struct
 import sys
 from contextlib import contextmanager
+from dataclasses import replace
 
 import pytest
 import tiny
@@ -21,6 +22,7 @@ from mipmap_plugin.levels.manifest import MANIFEST
 from mipmap_plugin.levels.streamed import EXTENT, distances, nearer, progression, viewer_settings, write_streamed
 from mipmap_plugin.levels.tiles import SCREEN_ERROR, bounding_box, errors, tileset, write_tile, write_tiles
 from mipmap_plugin.models import load_model
+from mipmap_plugin.models.vanilla import VanillaModel
 
 pytestmark = pytest.mark.usefixtures("brief_ladders", "few_views")
 
@@ -127,6 +129,19 @@ def test_levels_by_distance_are_shown_at_the_distances_that_they_were_made_for()
     assert (settings["lodBaseDistance"], settings["lodMultiplier"]) == (6.0, 1.7)
 
 
+def test_what_playcanvas_takes_for_levels_by_distance_of_a_scene_in_small_units_is_what_is_written():
+    made = LADDER | {"by": "distance", "lodBaseDistance": 0.05, "lodMultiplier": 1.19, "canvas": 1000}
+    settings = viewer_settings(made | {"base_pixel": 0.01 * 0.05 / distances(LADDER, 1000)[0]}, CHUNKS, 1000)
+    assert (settings["lodBaseDistance"], settings["lodMultiplier"]) == (0.1, 1.2)
+    assert settings["zooms"][0] < 0.7  # and not where they were made for
+
+
+def test_of_a_scene_too_small_for_playcanvas_the_command_says_so(ladder, tool):
+    write_json(ladder / MANIFEST, LADDER | {"base_pixel": 1e-5}, overwrite=True)
+    with pytest.warns(UserWarning, match="no level nearer than 0.1 units, and level 0 should end at 0.017: .* enlarge the scene"):
+        write_streamed(ladder, 1000)
+
+
 def test_chunks_of_a_scene_in_small_units_have_an_extent(ladder, tool):
     write_json(ladder / MANIFEST, LADDER | {"base_pixel": 0.001}, overwrite=True)
     assert EXTENT * distances(LADDER | {"base_pixel": 0.001}, 1000)[0] < 0.5
@@ -161,11 +176,20 @@ def test_tiles_go_from_the_coarsest_to_the_finest():
 
 def test_the_box_holds_every_splat():
     """In the axes of a tile, where (x, y, z) of a PLY lies at (-x, -z, -y)."""
-    box, splats = bounding_box(tiny.model()), tiny.gaussians()
+    box, splats = bounding_box([tiny.model()]), tiny.gaussians()
     for axis, of_ply in enumerate((0, 2, 1)):
         center, half = box[axis], box[3 + 4 * axis]
         assert float(-splats.means[:, of_ply].max()) > center - half and float(-splats.means[:, of_ply].min()) < center + half
     assert sum(box[3:]) == pytest.approx(box[3] + box[7] + box[11])
+
+
+def test_the_box_of_a_tile_holds_the_large_splats_of_coarser_levels_too(ladder, tool):
+    fine = tiny.gaussians()
+    coarse = VanillaModel.from_gaussians(replace(fine, scales=3 * fine.scales))
+    coarse.save(ladder / "level_2.ply", provenance={}, overwrite=True)
+    root = json.loads(write_tiles(ladder).read_text())["root"]
+    assert root["boundingVolume"]["box"] == pytest.approx(bounding_box([coarse]), abs=1e-5)
+    assert root["content"]["uri"] == "level_2.glb"
 
 
 def test_streamed_sog_is_written_with_its_levels_and_settings(ladder, tool):

@@ -3,11 +3,14 @@
 import hashlib
 import json
 import math
+import socket
 import sys
 import threading
 import time
+import warnings
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import anchor_checkpoints
@@ -27,13 +30,14 @@ from mipmap_plugin.models.base import why_no_viewer
 from mipmap_plugin.splatting.viewers import find_viewer
 from mipmap_plugin.viewing import adapting
 from mipmap_plugin.viewing import page as live_page
+from mipmap_plugin.viewing import server as viewing_server
 from mipmap_plugin.viewing.adapting import Adapter, Live, Progress, Wish
 from mipmap_plugin.viewing.around import BASE_PIXELS, NEAR, PIXELS, views_for_screen
 from mipmap_plugin.viewing.controls import MARKS, STOPS, figures, words
 from mipmap_plugin.viewing.pace import COARSEST, MOVING_S, Pace
 from mipmap_plugin.viewing.page import Page, PageSettings
 from mipmap_plugin.viewing.screen import LARGEST_FOV, Sampling, by_distance, by_lens, inside, pose_of, up_of, zoomed
-from mipmap_plugin.viewing.server import NO_VISER, check_address
+from mipmap_plugin.viewing.server import NO_VISER, check_address, served, without_words
 from mipmap_plugin.viewing.sources import File, Levels, Request, Supersampled, of_adapted, open_source
 from mipmap_plugin.viewing.stage import AMPLIFIED, Look, Stage
 
@@ -358,6 +362,12 @@ def digest(base):
 # The page, with something in the place of viser's server
 
 
+def client(**camera):
+    """A browser with a camera."""
+    pose = {"wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, 0.0, -3.0), "look_at": (0.0, 0.0, 0.0), "fov": 0.8, "image_width": 64, "image_height": 48}
+    return MagicMock(camera=SimpleNamespace(**pose | camera))
+
+
 @pytest.fixture
 def page(stage, base, monkeypatch, tmp_path):
     element = lambda *_, initial_value=None, **__: MagicMock(value=initial_value)  # noqa: E731
@@ -468,7 +478,7 @@ def test_a_camera_that_missed_the_sliders_zoom_is_moved_once_more_and_then_the_s
 @pytest.mark.parametrize("error", [MemoryError(), torch.OutOfMemoryError("CUDA out of memory"), RuntimeError("can't allocate memory")])
 def test_a_picture_that_does_not_fit_into_the_memory_does_not_end_the_page(page, screen, monkeypatch, error):
     monkeypatch.setattr(page._stage, "draw", MagicMock(side_effect=error))
-    page._draw(MagicMock(), Look("base"), (pose_of(screen, 2.0), 64, 48), 1.0)
+    page._tried(page._draw, MagicMock(), Look("base"), (pose_of(screen, 2.0), 64, 48), 1.0)
     assert page._controls.figures.content == live_page.OUT_OF_MEMORY
 
 
@@ -476,8 +486,55 @@ def test_a_picture_that_does_not_fit_into_the_memory_does_not_end_the_page(page,
 def test_a_browser_whose_camera_is_none_does_not_end_the_page_for_all(page, screen, monkeypatch, broken):
     browser = MagicMock()
     monkeypatch.setattr(live_page, "_view", lambda _: (replace(pose_of(screen, 2.0), **broken), 64, 48))
-    assert not page._serve(1, browser)
+    assert not page._tried(page._serve, 1, browser)
     assert not browser.scene.set_background_image.called and page._controls.figures.content.startswith(("the field of view", "camera 'screen'"))
+
+
+@pytest.mark.parametrize("sent", [{"position": (0.0, 0.0)}, {"image_width": None}])
+def test_a_browser_that_sends_nonsense_does_not_end_the_page_for_others(page, monkeypatch, sent):
+    odd, other = client(**sent), client()
+    page._server.get_clients.return_value = {1: odd, 2: other}
+    monkeypatch.setattr(page._changed, "wait", MagicMock(side_effect=[None, KeyboardInterrupt]))
+    with pytest.raises(KeyboardInterrupt):
+        page.run()
+    assert other.scene.set_background_image.called and not odd.scene.set_background_image.called
+
+
+@pytest.mark.parametrize(("element", "value", "told"), [("source", "nothing", "KeyError: 'nothing'"), ("pixel", "0", "ZeroDivisionError")])
+def test_what_goes_wrong_in_a_picture_is_told_and_the_next_one_is_drawn(page, element, value, told):
+    getattr(page._controls, element).value, browser = value, client()
+    page._tried(page._serve, 1, browser)
+    assert told in page._controls.figures.content and not browser.scene.set_background_image.called
+    getattr(page._controls, element).value = {"source": "base", "pixel": "1"}[element]
+    page._tried(page._serve, 1, browser)
+    assert browser.scene.set_background_image.called
+
+
+@pytest.mark.parametrize(("size", "drawn"), [
+    ((1280, 800), (1280, 800)), ((0, 0), (1, 1)), ((10**6, 1), (2**14, 1)), ((10**6, 10**6), (2**12, 2**12)), ((15360, 8640), (5461, 3072)),
+])  # fmt: skip
+def test_of_a_canvas_larger_than_any_screen_fewer_pixels_are_drawn(size, drawn):
+    _, width, height = live_page._view(client(image_width=size[0], image_height=size[1]))
+    assert (width, height) == drawn
+
+
+def test_a_window_of_no_size_is_drawn_with_enlarged_pixels(page):
+    """A window that is hidden has none."""
+    hidden = client(image_width=0, image_height=0)
+    page._controls.pixel.value = "8"
+    for number in range(2):  # the second is paced by the first
+        page._serve(number, hidden)
+    assert hidden.scene.set_background_image.call_count == 2
+
+
+def test_what_is_saved_is_not_saved_again(page, base, tmp_path):
+    """Two browsers may press the button at once."""
+    page.adapter.progress = Progress(adapted=base.adapt(1 / 2, recipe="instant"))
+    page._controls.save.disabled = False
+    page._save(None)
+    assert page._controls.save.disabled and page._controls.told.content == f"saved: {tmp_path / 'new.ply'}"
+    page._save(None)
+    assert page._controls.told.content.startswith("saved: ")  # and not that there is such a file
 
 
 # Words
@@ -497,6 +554,15 @@ def test_a_run_is_told_from_its_beginning_to_its_end(base):
 
 
 # The command
+
+
+@pytest.fixture(scope="module")
+def server():
+    pytest.importorskip("viser", reason="viser is not installed")
+    server = served("127.0.0.1", 0)
+    yield server
+    with without_words():
+        server.stop()
 
 
 def test_without_viser_the_command_says_what_to_install(tmp_path, monkeypatch, capsys):
@@ -529,6 +595,38 @@ def test_an_address_that_cannot_be_served_is_told():
     with pytest.raises(SettingsError, match="nothing can be served at"):
         check_address("192.0.2.1", 8080)  # an address for documentation, which no machine has
     check_address("127.0.0.1", 0)
+
+
+@pytest.mark.parametrize(("page", "host", "taken"), [
+    (None, "", True),  # no browser
+    ("http://127.0.0.1:{port}", "", True),
+    ("http://localhost:{port}", "localhost:{port}", True),  # through ssh -L
+    ("https://scenes.example", "scenes.example", True),  # behind a proxy
+    ("http://evil.example", "", False),
+    ("http://127.0.0.1:1", "", False),
+    ("null", "", False),  # a file
+])  # fmt: skip
+def test_only_its_own_page_sees_the_scene(server, page, host, taken):
+    """A browser lets every page talk to this machine, and says which one does."""
+    headers = ["Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA=="]
+    headers += ["Host: " + (host or "127.0.0.1:{port}"), *([] if page is None else [f"Origin: {page}"])]
+    port = server.get_port()
+    with warnings.catch_warnings(record=True) as told, socket.create_connection(("127.0.0.1", port)) as connection:
+        warnings.simplefilter("always")
+        connection.sendall("\r\n".join(["GET / HTTP/1.1", *headers, "", ""]).format(port=port).encode())
+        assert connection.recv(99).split()[1] == (b"101" if taken else b"403")
+    ours = [str(each.message) for each in told if each.filename == viewing_server.__file__]
+    assert len(ours) == (not taken) and all(f"a page of '{page}' asked".format(port=port) in each for each in ours)
+
+
+def test_a_browser_that_is_closed_while_its_picture_is_drawn_is_nothing_to_warn_of(monkeypatch):
+    pytest.importorskip("websockets", reason="viser is not installed")
+    monkeypatch.setitem(sys.modules, "viser", MagicMock())
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        served("127.0.0.1", 0)
+        warnings.warn("Queued a BackgroundImageMessage on a closed connection (e.g. ...); it will never be delivered.", stacklevel=1)
+    assert told == []
 
 
 def test_what_is_saved_takes_a_free_name(tmp_path):

@@ -66,6 +66,7 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
     from mipmap_plugin.levels.room import room_for
     from mipmap_plugin.levels.streamed import SINGLE_LEVEL
+    from mipmap_plugin.models.outputs import refuse_far
     from mipmap_plugin.models.places import state_path
     from mipmap_plugin.process import threads
 
@@ -74,6 +75,8 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     refuse_ladder(output, wrapped, overwrite=overwrite, room=room_for(wrapped, request, unfinished))
     if exports.streamed_sog and (bound := _ends_at_once(wrapped, request)):
         raise SettingsError(f"{SINGLE_LEVEL}; give a smaller {bound}, or leave --streamed-sog out")
+    if exports.tiles and not wrapped.model.traits.no_viewer:
+        refuse_far(output, wrapped.model.parameters()["means"], "leave --tiles out")
     if not wrapped.cameras:
         warnings.warn(NO_CAMERAS, stacklevel=2)
     ladder = _made(wrapped, request, unfinished)

@@ -11,6 +11,7 @@ the chunks. Seen from afar, from any direction alike, the nearest point is close
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
@@ -42,6 +43,8 @@ BUDGET = 1_000_000
 
 # PlayCanvas's bounds of `lodBaseDistance`, in world units, and of `lodMultiplier`.
 NEAREST, LEAST_MULTIPLIER = 0.1, 1.2
+
+TOO_SMALL = "PlayCanvas changes no level nearer than {least:g} units, and level 0 should end at {first:.2g}: it stays too long; enlarge the scene"
 
 # The part of the distance of the first switch that the camera moves before PlayCanvas looks again which levels to show; its own is 1 unit.
 MOVED = 1 / 50
@@ -79,7 +82,8 @@ def viewer_settings(manifest: dict[str, Any], chunks: Sequence[Chunk], canvas: i
     scales = [level["scale"] for level in manifest["levels"]]
     base, multiplier = progression([max(distance - offset, distance / 2) for distance in rising], scales[0] / scales[1])
     if by_distance:
-        base, multiplier = manifest["lodBaseDistance"] * canvas / manifest["canvas"], manifest["lodMultiplier"]
+        base = max(manifest["lodBaseDistance"] * canvas / manifest["canvas"], NEAREST)
+        multiplier = max(manifest["lodMultiplier"], LEAST_MULTIPLIER)
     shown = [base * multiplier**number + offset for number in range(len(rising))]
     return {
         "lodBaseDistance": base,
@@ -101,6 +105,8 @@ def write_streamed(folder: Path, canvas: int = CANVAS, *, overwrite: bool = Fals
     rising = distances(manifest, canvas)
     if not rising:
         raise SettingsError(f"{folder}: {SINGLE_LEVEL}; open its level as it is")
+    if rising[0] < NEAREST:
+        warnings.warn(TOO_SMALL.format(least=NEAREST, first=rising[0]), stacklevel=2)
     with new_folder(folder / STREAMED, overwrite) as temporary, TemporaryDirectory(prefix=TEMPORARY) as copies:
         made = temporary / LOD_META
         extent = manifest.get("chunk_extent", max(1, round(EXTENT * rising[0])))

@@ -13,6 +13,7 @@ from __future__ import annotations
 import gzip
 import shutil
 import struct
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -31,6 +32,7 @@ from mipmap_plugin.levels.exported import readable
 from mipmap_plugin.levels.manifest import read_manifest
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.models.outputs import refuse_far
 
 TILES, TILESET = "tiles", "tileset.json"
 
@@ -72,27 +74,28 @@ def tileset(manifest: dict[str, Any], box: list[float]) -> dict[str, Any]:
     return {"asset": {"version": "1.1"}, **said, "geometricError": farthest, "root": tile}
 
 
-def bounding_box(model: SplatModel) -> list[float]:
-    """The box around all splats as 3D Tiles write it: its center, then half of each of its three axes."""
-    low, high = _bounds(model, REACH)
+def bounding_box(levels: Iterable[SplatModel]) -> list[float]:
+    """The box around all splats of all levels (merged ones reach farther), as 3D Tiles write it: its center, then half of each of its axes."""
+    lows, highs = zip(*(_bounds(model) for model in levels), strict=True)
+    low, high = torch.stack(lows).amin(dim=0), torch.stack(highs).amax(dim=0)
     center, half = (each[list(AXES)] for each in ((low + high) / -2, (high - low) / 2))
     return [*center.tolist(), *torch.diag(half).flatten().tolist()]
 
 
-def _bounds(model: SplatModel, reach: float) -> tuple[Tensor, Tensor]:
-    """The least and the greatest coordinates of all splats, [3] each, `reach` standard deviations beyond their centers."""
+def _bounds(model: SplatModel) -> tuple[Tensor, Tensor]:
+    """The least and the greatest coordinates of all splats, [3] each."""
     splats = model.gaussians(ONE_PIXEL).detach()
-    beyond: Tensor = reach * splats.scales.max(dim=1).values[:, None]
+    beyond: Tensor = REACH * splats.scales.max(dim=1).values[:, None]
     return (splats.means - beyond).amin(dim=0), (splats.means + beyond).amax(dim=0)
 
 
 def write_tile(ply: Path, tile: Path) -> None:
-    """Write a GLB of the splats of a PLY. Raises SettingsError without splat-transform, OutputError."""
-    compressed = tile.with_suffix(".spz")
+    """Write a GLB of the splats of a PLY. Raises SettingsError without splat-transform and for splats too far away, OutputError."""
+    compressed, means = tile.with_suffix(".spz"), load_model(ply).parameters()["means"].detach()
+    refuse_far(tile, means, "open the level itself")
     with TemporaryDirectory(prefix=TEMPORARY) as folder:
         write_exchange(compressed, partial(shutil.copyfile, readable(ply, Path(folder, ply.name))), overwrite=False)
-    low, high = _bounds(load_model(ply), 0.0)
-    tile.write_bytes(glb(compressed.read_bytes(), low.tolist(), high.tolist()))
+    tile.write_bytes(glb(compressed.read_bytes(), means.amin(dim=0).tolist(), means.amax(dim=0).tolist()))
     compressed.unlink()
 
 
@@ -120,7 +123,7 @@ def write_tiles(folder: Path, *, overwrite: bool = False) -> Path:
     Raises SettingsError without splat-transform, OutputExists, OutputError.
     """
     manifest = read_manifest(folder)
-    box = bounding_box(load_model(folder / manifest["levels"][0]["file"]))
+    box = bounding_box(load_model(folder / level["file"]) for level in manifest["levels"])
     with new_folder(folder / TILES, overwrite) as temporary:
         for number, level in enumerate(manifest["levels"]):
             write_tile(folder / level["file"], temporary / f"level_{number}.glb")

@@ -27,6 +27,10 @@ WRITTEN = (
 # Rows that are checked together, so that there is no second copy of all.
 CHUNK = 1 << 17
 
+# World units: SPZ, as splat-transform writes it, has 24 bits for a coordinate, 12 of them for parts of a unit. Splats farther away would be put 4,096
+# units elsewhere without a word.
+SPZ_REACH = 2048.0
+
 # Finite numbers that in float32 activate as an infinite logit and logarithm do: to an opacity of 1 or 0, and a length of almost 0.
 LOGIT, LOG_SCALE = 80.0, -87.0
 
@@ -62,13 +66,23 @@ def _is_of_a_training(ply: Path) -> bool:
     return kind_of(ply) == "ply" and provenance_of(read_header(ply).comments) is None
 
 
-def refuse_format(path: Path, trained: TrainedScale) -> None:
-    """Raise SettingsError for an exchange format at `path` if the splats need the screen filter of their training, or if it cannot be written."""
+def refuse_format(path: Path, trained: TrainedScale, means: Tensor) -> None:
+    """Raise SettingsError for an exchange format at `path` if the splats need the screen filter of their training, or if it cannot be written, or has
+    no place for their centers `means` [N, 3]."""
     if trained.keeps_filter:
         own = f"the filter of their own project ({trained.screen_filter}, {trained.eps2d:g} px²)"
         raise SettingsError(f"{path}: these splats need {own}; give a .ply or a folder, or adapt for a viewer if the family allows it")
     if not is_glb(path):
         refuse_exchange(path)
+    if path.suffix.lower() == ".spz":
+        refuse_far(path, means, "give a .sog or a .ply")
+
+
+def refuse_far(path: Path, means: Tensor, instead: str) -> None:
+    """Raise SettingsError for centers [N, 3] that SPZ has no place for. `instead`: what else can be done."""
+    if far := int((means.detach().abs() >= SPZ_REACH).any(dim=1).sum()):
+        where = f"lie {SPZ_REACH:,.0f} or more units from the origin along an axis, where SPZ has no place for them"
+        raise SettingsError(f"{path}: {far:,} of {len(means):,} splats {where}; move or shrink the scene, or {instead}")
 
 
 def without_place(path: Path, extras: Iterable[str], sh_degree: int = 0) -> str:

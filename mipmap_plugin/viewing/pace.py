@@ -29,5 +29,5 @@ class Pace:
         """The fraction of the width and height of a picture of so many pixels that can be drawn in time."""
         if self._seconds_per_pixel is None:
             return COARSEST
-        affordable = math.sqrt(MOVING_S / (self._seconds_per_pixel * pixels))
+        affordable = math.sqrt(MOVING_S / (self._seconds_per_pixel * max(1, pixels)))
         return min(1.0, max(COARSEST, affordable))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
@@ -24,6 +26,10 @@ from mipmap_plugin.viewing.sources import File, of_adapted
 from mipmap_plugin.viewing.stage import Look, Stage, smaller
 
 OUT_OF_MEMORY = "out of memory; enlarge pixels, or make the window smaller"
+
+# px of a canvas, in all and along a side: of a larger one fewer are drawn, and the browser enlarges them. A screen of 5K has 15 million; JPEG and
+# the memory end soon after.
+MOST_PIXELS, LONGEST_SIDE = 2**24, 2**14
 
 # Views of an orbit that are looked at to find one to begin with, before the page is there.
 LOOKED_AT = 16
@@ -87,9 +93,21 @@ class Page:
         while True:
             self._changed.wait(PERIOD_S)
             self._changed.clear()
-            still = [self._serve(number, client) for number, client in self._server.get_clients().items()]
+            still = [self._tried(self._serve, number, client) for number, client in self._server.get_clients().items()]
             if all(still) and time.monotonic() - self._slid > HANDS_OFF_S:
-                self._settle()
+                self._tried(self._settle)
+
+    def _tried(self, work: Callable[..., bool | None], *of: Any) -> bool | None:
+        """What `work` returns. What goes wrong is told on the page and does not end it, neither for other browsers nor for what waits to be saved."""
+        try:
+            return work(*of)
+        except Exception as error:
+            expected = isinstance(error, MipmapPluginError)
+            told = OUT_OF_MEMORY if is_out_of_memory(error) else str(error) if expected else f"{type(error).__name__}: {error}"
+            if not expected and told not in (OUT_OF_MEMORY, self._controls.figures.content):
+                traceback.print_exc()
+            self._controls.figures.content = told
+            return False
 
     def close(self) -> None:
         """End a run that is adapting, and the server."""
@@ -155,13 +173,7 @@ class Page:
 
     def _draw(self, client: Any, look: Look, view: tuple[Pose, int, int], coarse: float) -> None:
         pose, width, height = view
-        try:
-            picture = self._stage.draw(look, pose.camera(width, height), coarse)
-        except (MipmapPluginError, MemoryError, RuntimeError) as error:
-            if not isinstance(error, MipmapPluginError) and not is_out_of_memory(error):
-                raise
-            self._controls.figures.content = str(error) if isinstance(error, MipmapPluginError) else OUT_OF_MEMORY
-            return
+        picture = self._stage.draw(look, pose.camera(width, height), coarse)
         self._pace.learn(picture.drawn.width * picture.drawn.height, picture.seconds)
         client.scene.set_background_image(_bytes(picture.image), format="png" if coarse == 1 else "jpeg", jpeg_quality=QUALITY)
         if coarse == 1:
@@ -239,7 +251,7 @@ class Page:
 
     def _save(self, _: Any) -> None:
         adapted = self.adapter.progress.adapted
-        if adapted is None:
+        if adapted is None or self._controls.save.disabled:  # another browser was quicker
             return
         try:
             saved = adapted.save(self._settings.output(adapted.report.scale, adapted.report.viewer))
@@ -263,7 +275,9 @@ def _view(client: Any) -> tuple[Pose, int, int]:
     """The pose of a browser's camera, and the width and height of its canvas in px."""
     camera = client.camera
     wxyz, position, look_at = (tuple(map(float, each)) for each in (camera.wxyz, camera.position, camera.look_at))
-    return Pose(wxyz, position, look_at, float(camera.fov)), max(1, camera.image_width), max(1, camera.image_height)
+    width, height = max(1, camera.image_width), max(1, camera.image_height)
+    part = min(1.0, math.sqrt(MOST_PIXELS / (width * height)), LONGEST_SIDE / max(width, height))
+    return Pose(wxyz, position, look_at, float(camera.fov)), max(1, int(part * width)), max(1, int(part * height))
 
 
 def _move(client: Any, pose: Pose) -> None:

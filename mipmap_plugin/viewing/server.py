@@ -6,9 +6,18 @@ import contextlib
 import errno
 import io
 import socket
+import warnings
+from collections.abc import Iterator, Mapping
+from http import HTTPStatus
 from typing import Any
 
 from mipmap_plugin.errors import SettingsError, install
+
+# Where a proxy stands between, its user has to know what is wrong, as the page only waits.
+FOREIGN = "a page of {origin} asked for this one's pictures, and got none; if it is this one behind a proxy, let it pass on Host or X-Forwarded-Host"
+
+# viser warns, in our name, of a picture for a browser that was closed while it was drawn.
+CLOSED = "Queued a .* on a closed connection"
 
 NO_VISER = f"the live view needs viser; {install('view')}"
 
@@ -20,8 +29,40 @@ def served(host: str, port: int) -> Any:
     except ImportError as error:
         raise SettingsError(NO_VISER) from error
     check_address(host, port)
-    with without_words():
+    warnings.filterwarnings("ignore", message=CLOSED)
+    with without_words(), _own_pages_only():
         return viser.ViserServer(host=host, port=port, verbose=False)
+
+
+@contextlib.contextmanager
+def _own_pages_only() -> Iterator[None]:
+    """Let pages of others not talk to what viser serves inside the block, for which it has no setting: a browser lets each of its pages reach this
+    machine, and so see the scene, adapt and save."""
+    from websockets.asyncio import server
+
+    serve = server.serve
+
+    def guarded(*args: Any, process_request: Any, **options: Any) -> Any:
+        def answer(connection: Any, request: Any) -> Any:
+            if not foreign_page(request.headers):
+                return process_request(connection, request)
+            warnings.warn(FOREIGN.format(origin=ascii(request.headers["Origin"])), stacklevel=1)  # ours, as the command hides others
+            return connection.respond(HTTPStatus.FORBIDDEN, "this page is not that of the live view\n")
+
+        return serve(*args, process_request=answer, **options)
+
+    server.serve = guarded  # type: ignore[assignment,misc]
+    try:
+        yield
+    finally:
+        server.serve = serve  # type: ignore[misc]
+
+
+def foreign_page(headers: Mapping[str, str]) -> bool:
+    """Whether a browser asks for a connection on behalf of another page. Only browsers name one, and a proxy may name the host it was asked for."""
+    page = headers.get("Origin")
+    hosts = (headers.get("Host"), headers.get("X-Forwarded-Host"))
+    return page is not None and headers.get("Upgrade") is not None and page.partition("://")[2] not in hosts
 
 
 def without_words() -> contextlib.AbstractContextManager[Any]:
