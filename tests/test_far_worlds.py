@@ -5,12 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+import tiny
 import torch
 from tiny import cameras
 
+from mipmap_plugin.adaptation.in_viewers import too_far_out
 from mipmap_plugin.adaptation.optimization.density import ScreenGradients
 from mipmap_plugin.adaptation.pixel_size import pixel_size
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.models.mip import filter_3d_of
+from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.splatting.viewers import find_viewer
+from mipmap_plugin.wrap import wrap_model
 
 # World units. float32 knows places to 1/16 unit there, and rotation · point + translation to no better than 1/4.
 FAR = torch.tensor([1e6, -1e6, 5e5], dtype=torch.float64)
@@ -53,3 +59,18 @@ def screen_gradients(points, view):
 def test_it_is_seen_as_at_the_origin(seen, views):
     here, there = seen(POINTS, views), seen(POINTS + FAR.float(), [moved(view) for view in views])
     torch.testing.assert_close(there, here, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(("viewer", "is_off"), [("spark", True), ("playcanvas", False)])
+def test_a_viewer_that_keeps_positions_in_16_bits_does_not_suit_a_scene_out_there(viewer, is_off):
+    targets, here = {viewer: find_viewer(viewer).effects(Effects(1))}, tiny.gaussians()
+    there = VanillaModel.from_gaussians(replace(here, means=here.means + FAR.float()))
+    assert too_far_out(VanillaModel.from_gaussians(here), cameras(), targets) == ""
+    assert ("spark keeps positions in 16 bits, by which 100% of" in too_far_out(there, [moved(view) for view in cameras()], targets)) == is_off
+
+
+def test_adapting_for_such_a_viewer_warns():
+    splats, view = tiny.gaussians(), cameras(1, width=8, height=6)[0]
+    far = wrap_model(VanillaModel.from_gaussians(replace(splats, means=splats.means + FAR.float())), cameras=[moved(view)], backend="reference")
+    with pytest.warns(UserWarning, match="spark keeps positions in 16 bits"):
+        far.adapt(1 / 2, recipe="instant", merge_to=1.0, viewer="spark", views="given", validation_views=2)

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+
+import torch
 
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, Validation
 from mipmap_plugin.adaptation.renderers import Renderer
 from mipmap_plugin.backends.base import Backend
+from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.splatting.packing import in_two_steps, packed
+
+# Views and splats that are looked at for what a viewer's positions do, and the fraction of the splats that has to be displaced for a word about it.
+LOOKED_AT, SAMPLES, DISPLACED = 4, 1 << 14, 0.5
 
 
 def psnr_per_viewer(validation: Validation, backend: Backend, targets: Mapping[str, Effects], model: SplatModel) -> dict[str, float]:
@@ -39,3 +46,19 @@ def better_as_trained(as_trained: float | None, psnr: float, effects: Effects) -
         return []
     own = f"drawn as its training drew it ({effects.screen_filter} {effects.eps2d:g} px²), the base itself has {as_trained:.2f} dB"
     return [f"{own} on the same views, more than this file's {psnr:.2f}: for a renderer that draws so, adapt without a viewer"]
+
+
+def too_far_out(model: SplatModel, views: Sequence[Camera], targets: Mapping[str, Effects]) -> str:
+    """That a viewer which keeps positions in 16 bits displaces most splats by more than their size, or loses them, in a sentence; "" if none does."""
+    for viewer, effects in targets.items():
+        positions = effects.settings.packing and in_two_steps(effects.settings.packing)[1]
+        if not positions:
+            continue
+        splats = model.gaussians(views[0]).detach()
+        splats = splats[:: max(1, len(splats) // SAMPLES)]
+        moved = [(packed(splats, view, positions).means - splats.means).abs().amax(1) for view in evenly(views, LOOKED_AT)]
+        share = float((torch.stack(moved) > splats.scales.abs().amax(1)).double().mean())
+        if share > DISPLACED:
+            where = f"{viewer} keeps positions in 16 bits, by which {share:.0%} of the splats are off by more than their size, or lost"
+            return f"{where}; move the scene to the world's origin, or scale it down, with its cameras, or give another viewer"
+    return ""

@@ -13,7 +13,7 @@ from pathlib import Path
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch
 from mipmap_plugin.adaptation.following import Following, release
-from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_trained, psnr_per_viewer
+from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_trained, psnr_per_viewer, too_far_out
 from mipmap_plugin.adaptation.moments import at_their_moments, evaluate_moments
 from mipmap_plugin.adaptation.optimization.amount import affordable_for_model, affordable_moments, fewer_note, looks_in_budget, takes_steps
 from mipmap_plugin.adaptation.optimization.budget import no_steps_notes, plan_note, within_budget
@@ -113,7 +113,8 @@ class Session:
         if self._base_is_right:
             copy, reason = self._for_target(self.base), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
-        for remark in filter(None, [*remarks(self.base_views, self.base, near, orbit=self._orbits), too_unlike(self.base_views)]):
+        found = too_unlike(self.base_views), too_far_out(self.base, self.base_views, self.targets)
+        for remark in filter(None, [*remarks(self.base_views, self.base, near, orbit=self._orbits), *found]):
             warn(remark)
         began = now(self.device) - self.seconds["total"]
         self._compile()

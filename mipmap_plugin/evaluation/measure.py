@@ -50,6 +50,11 @@ class Baseline:
     render: RenderView
 
 
+def supersampled(n: int) -> str:
+    """The name of the baseline of n x n samples per pixel."""
+    return f"supersampling, {n} x {n}"
+
+
 def baselines(
     model: Wrapped,
     scale: float,
@@ -82,7 +87,7 @@ def baselines(
     found += [rendered(name, "filter", name) for name in available]
     finest = math.ceil(1 / scale)  # samples as fine as the base's own pixels; finer ones make no difference
     counts = (finest,) if samples is None else samples
-    found += [rendered(f"supersampling, {n} x {n}", "supersampling", "scaled", n) for n in counts if 1 < n <= max(2, finest)]
+    found += [rendered(supersampled(n), "supersampling", "scaled", n) for n in counts if 1 < n <= max(2, finest)]
     n = math.ceil(1 / (WINDOW_REACH * scale))
     if "window" in available and n > 1:
         found.append(rendered(f"window, {n} x {n} samples", "supersampling", "window", n))

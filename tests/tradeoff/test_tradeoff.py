@@ -89,7 +89,8 @@ def test_without_cameras_the_views_that_are_judged_on_look_from_above_what_is_sa
 
 
 def test_without_photographs_the_label_says_what_the_truth_is():
-    out, in_ = (base_itself(wrapped(), scale, 1).label for scale in (1 / 4, 4))
+    out, between, in_ = (base_itself(wrapped(), scale, 1).label for scale in (1 / 4, 0.3, 4))
+    assert between == "dB against the base's image, made smaller (no photographs), 1 views"
     assert out == "dB against the base supersampled 4 x 4 (no photographs), 1 views"
     assert in_ == "dB of the image, shrunk, against the base itself (no photographs), 1 views"
 
@@ -156,9 +157,9 @@ def test_the_adapted_model_is_drawn_with_every_setting_of_a_renderer(points):
     assert drawn["alpha from 1/16"].psnr_db.median != pytest.approx(usual, abs=1e-3)
 
 
-@pytest.mark.parametrize(("scale", "samples"), [(1 / 4, [2]), (1 / 2, []), (0.3, [2]), (2, [2])])
+@pytest.mark.parametrize(("scale", "samples"), [(1 / 4, [2]), (1 / 2, []), (0.3, [2, 4]), (2, [2])])
 def test_the_base_is_not_compared_with_itself(scale, samples):
-    """Nor is the truth enlarged and shrunk again, or sampled in as many places as it was."""
+    """Nor is the truth enlarged and shrunk again, or sampled in as many places as it was. At x0.3 no whole pixels of the base fit into a pixel."""
     model, plan = wrapped(), replace(PLAN, supersampling=(2, 4, 8))
     names = [each.name for each in measuring._baselines(model, base_itself(model, scale, 1), scale, plan)]
     assert "base, resized" not in names

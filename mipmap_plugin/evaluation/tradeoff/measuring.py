@@ -3,7 +3,6 @@ adaptation. The time to measure quality is not counted, and evaluated views are 
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
@@ -24,7 +23,6 @@ from mipmap_plugin.evaluation.cells import Cells
 from mipmap_plugin.evaluation.measure import (
     BASE,
     FILTERS,
-    RESIZED,
     Baseline,
     RenderView,
     adapt_alone,
@@ -149,12 +147,10 @@ def on_backend(model: Wrapped, name: str) -> Wrapped:
 
 
 def _baselines(model: Wrapped, truth: GroundTruth, scale: float, plan: Plan) -> list[Baseline]:
-    """All baselines, except those that are the truth itself: of the base's own image, resized, and of as many samples as it has pixels."""
+    """All baselines, except those that are the truth itself."""
     found = baselines(model, scale, truth.shrink_by, filters=_filters(model), samples=plan.supersampling)
     found += [base_in_viewer(plan.viewer, model, scale)] if plan.viewer else []
-    finest = math.ceil(1 / scale)
-    itself = (RESIZED, f"supersampling, {finest} x {finest}") if truth.is_base else ()
-    return [baseline for baseline in found if baseline.name not in itself]
+    return [baseline for baseline in found if baseline.name not in truth.itself]
 
 
 def _filters(model: Wrapped) -> list[str]:

@@ -15,7 +15,7 @@ from mipmap_plugin.adaptation.views import choose_views, with_times
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.evaluation.measure import resized_base, views_seen
+from mipmap_plugin.evaluation.measure import RESIZED, resized_base, supersampled, views_seen
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.other_scene import of_another_scene
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, TruthView, photographed_views
@@ -39,7 +39,7 @@ class GroundTruth:
     adapt_on: list[Camera]  # the other cameras, to adapt to; none: an orbit is generated
     psnr: Callable[[Camera, Tensor], float]  # (one of the views, the image of it at the new scale) -> dB
     shrink_by: str  # the filter that made the truth smaller
-    is_base: bool  # the truth is the base's own image, to which that image, resized, is no rival
+    itself: tuple[str, ...] = ()  # the baselines that the truth is, and that are no rivals to it
 
 
 def photographs(model: Wrapped, scene: Scene, scale: float, most: int | None) -> GroundTruth:
@@ -60,12 +60,13 @@ def photographs(model: Wrapped, scene: Scene, scale: float, most: int | None) ->
         warnings.warn(doubt, stacklevel=2)
     truths = {view: judged[view].truth(scale, protocol) for view in views}
     label = f"real dB, protocol P3 on {len(views)} photographs"
-    return GroundTruth(label, views, adapt_on, lambda view, image: psnr(protocol.as_saved(image), truths[view]), protocol.shrink_by, False)
+    return GroundTruth(label, views, adapt_on, lambda view, image: psnr(protocol.as_saved(image), truths[view]), protocol.shrink_by)
 
 
 @torch.no_grad()
 def base_itself(model: Wrapped, scale: float, most: int | None, views: Sequence[Camera] = ()) -> GroundTruth:
-    """The truth without photographs. Zoom-out: the supersampled base. Zoom-in: the base, with which images are compared after shrinking.
+    """The truth without photographs. Zoom-out: the base's image, made smaller, which is the supersampled base where whole pixels of it fit.
+    Zoom-in: the base, with which images are compared after shrinking.
 
     `views`: to evaluate on, instead of at most `most` that are held out here.
     """
@@ -74,11 +75,14 @@ def base_itself(model: Wrapped, scale: float, most: int | None, views: Sequence[
     base_images = {view: model.render(view).image.clamp(0, 1) for view in views}
     if scale > 1:
         label = f"dB of the image, shrunk, against the base itself (no photographs), {len(views)} views"
-        return GroundTruth(label, views, adapt_on, lambda view, image: psnr(resize(image, view.size, "area"), base_images[view]), "area", True)
-    n = math.ceil(1 / scale)
-    label = f"dB against the base supersampled {n} x {n} (no photographs), {len(views)} views"
+        return GroundTruth(label, views, adapt_on, lambda view, image: psnr(resize(image, view.size, "area"), base_images[view]), "area", (RESIZED,))
+    n, itself = math.ceil(1 / scale), [RESIZED]
+    made = "the base's image, made smaller"
+    if all(view.size == tuple(n * side for side in view.zoomed(scale).size) for view in views):
+        made, itself = f"the base supersampled {n} x {n}", [RESIZED, supersampled(n)]
+    label = f"dB against {made} (no photographs), {len(views)} views"
     truths = {view: resized_base(image, view.zoomed(scale).size, shrink_by="area") for view, image in base_images.items()}
-    return GroundTruth(label, views, adapt_on, lambda view, image: psnr(image, truths[view]), "area", True)
+    return GroundTruth(label, views, adapt_on, lambda view, image: psnr(image, truths[view]), "area", tuple(itself))
 
 
 def unseen(model: Wrapped, adapted_to: Sequence[Camera]) -> list[Camera]:
