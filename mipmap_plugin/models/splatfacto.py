@@ -91,7 +91,9 @@ class SplatfactoHost:
         frame = self._frame()
         frame[:3] /= capture.applied_scale  # contained in the file's scale, but already applied to the poses
         factor = _factor(cameras, self.options.get("downscale_factor"), capture)
-        return [_shrunk(camera, factor).moved(frame) for camera in cameras]
+        ratio = self.options.get("camera_res_scale_factor")  # the datamanager resizes what the dataparser found
+        again = 1 / ratio if isinstance(ratio, (int, float)) and ratio > 0 else 1.0
+        return [_shrunk(_shrunk(camera, factor), again).moved(frame) for camera in cameras]
 
     def _content(self, parameters: dict[str, Tensor], comments: Sequence[str]) -> dict[str, Any]:
         content = load_torch(self.source)
