@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from mipmap_plugin.errors import SceneError
-from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.scenes import load_photographs, load_scene
 
 pycolmap = pytest.importorskip("pycolmap", reason="COLMAP scenes are read by pycolmap, an extra")
 
@@ -106,6 +106,21 @@ def test_a_checkpoint_with_cfg_args_has_its_principal_point_in_the_middle(tmp_pa
     write_text_model(tmp_path / "bent/sparse/0", names(1), "SIMPLE_RADIAL", "70 20 24 0.1")  # it was trained on the undistorted one
     camera = load_scene(tmp_path / "bent", {"eval": True}).cameras[0]
     assert (camera.cx, camera.cy) == (camera.width / 2, camera.height / 2)
+
+
+@pytest.mark.parametrize(
+    ("option", "model", "params", "size"),
+    [("n_offsets", "SIMPLE_RADIAL", "70 32 24 0.1", (48, 64)), ("kplanes_config", "OPENCV", "70 70 32 24 0.1 0 0 0", (48, 64)),
+     ("n_offsets", "OPENCV", "70 70 32 24 0.1 0 0 0", (45, 61)), ("kernel_size", "SIMPLE_RADIAL", "70 32 24 0.1", (45, 61))],
+)  # fmt: skip
+def test_some_projects_train_on_photographs_as_they_are(tmp_path, option, model, params, size):
+    """scene/dataset_readers.py of Scaffold-GS, Octree-GS and 4DGaussians; elsewhere only photographs that were undistorted before are trained on."""
+    write_text_model(tmp_path / "sparse/0", names(2), model, params)
+    write_photographs(tmp_path / "images", names(1))
+    as_it_is = size == (48, 64)
+    for scene in (load_scene(tmp_path, {option: 10, "resolution": 1}), load_photographs(tmp_path, {option: 10, "resolution": 8})):
+        assert {camera.size for camera in scene.cameras} == {size}
+        assert bool(scene.lenses) != as_it_is and any("for pinholes" in note for note in scene.notes) == as_it_is
 
 
 @pytest.mark.parametrize(

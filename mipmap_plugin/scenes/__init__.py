@@ -12,7 +12,7 @@ from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.scenes.base import Scene
 from mipmap_plugin.scenes.cameras_json import read_cameras, write_cameras
-from mipmap_plugin.scenes.colmap import is_colmap, read_colmap
+from mipmap_plugin.scenes.colmap import UNBENT, is_colmap, read_colmap, unbent_by
 from mipmap_plugin.scenes.in_ply import cameras_in
 from mipmap_plugin.scenes.moving import DEFORMABLE, is_dynerf, is_hypernerf, read_dynerf, read_hypernerf
 from mipmap_plugin.scenes.orbits import orbit
@@ -65,10 +65,13 @@ def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
 def load_photographs(path: str | Path, cfg: dict[str, Any]) -> Scene:
     """The scene at `path` with photographs at their own size, whatever size a checkpoint with these cfg_args was trained at.
 
-    Only the options of Deformable 3D Gaussians count, and of HyperNeRF's captures alone, which it moves and scales. Raises SceneError.
+    Only those options count by which Deformable 3D Gaussians moves and scales HyperNeRF's captures, and others take lenses of COLMAP for pinholes.
+    Raises SceneError.
     """
     path = path_of(path)
-    return load_scene(path, {**cfg, "resolution": 1} if DEFORMABLE in cfg and is_hypernerf(path) else None)
+    if DEFORMABLE in cfg and is_hypernerf(path):
+        return load_scene(path, {**cfg, "resolution": 1})
+    return load_scene(path, {name: cfg[name] for name in (*UNBENT, "eval") if name in cfg} if unbent_by(cfg) and is_colmap(path) else None)
 
 
 def model_cameras(folder: str | Path | None, cfg: dict[str, Any] | None = None) -> list[Camera]:

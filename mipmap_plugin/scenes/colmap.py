@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -28,13 +29,16 @@ MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".", "0")  # the last: the fo
 # Folders between a model and the folder of photographs, which is beside the highest: nerfstudio has all of them.
 BETWEEN = ("0", "sparse", "colmap")
 
+# An option in the cfg_args of Scaffold-GS and Octree-GS, and one of 4DGaussians; and the lenses that bend which these take for pinholes.
+UNBENT = {"n_offsets": ("SIMPLE_RADIAL",), "kplanes_config": ("SIMPLE_RADIAL", "OPENCV")}
+
 
 def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     """The scene of a folder with `sparse/0` and images, or of the folder of the model itself.
 
     `cfg` is the checkpoint's cfg_args: `images` names the folder of photographs and `resolution` the training size; the principal
-    point is moved to the center, as projects with cfg_args do. Without it, the photographs in `images` are used at their full
-    size. A camera whose photograph is missing stays a usable view; `notes` count them.
+    point is moved to the center, as projects with cfg_args do, and lenses that the project takes for pinholes are (`UNBENT`). Without it, the
+    photographs in `images` are used at their full size. A camera whose photograph is missing stays a usable view; `notes` count them.
 
     Raises:
         SceneError: no pycolmap, no readable model, a lens that cannot be undistorted, or an invalid `resolution`.
@@ -56,10 +60,10 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     cameras: list[Camera] = []
     photographs: dict[Camera, Path] = {}
     lenses: dict[Path, Lens] = {}
-    trained = count()
+    trained, unbent = count(), unbent_by(cfg)
     for index, image in enumerate(images):
         camera = _camera(model, image, "train" if index % TEST_EVERY else "test", centered=bool(cfg))
-        photograph, lens = folder / image.name, _lens(model.cameras[image.camera_id])
+        photograph, lens = folder / image.name, _lens(model.cameras[image.camera_id], unbent)
         exists, options = is_file(photograph), cfg
         if exists:
             size, options = image_size(photograph), {**cfg, "images": "images", "ds": 1}
@@ -75,7 +79,14 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         if exists:
             photographs[camera] = photograph
     notes = _notes(cameras, photographs, folder, cfg) + ([note(lenses.values())] if lenses else [])
+    if models := sorted({lens.model for camera in model.cameras.values() if (lens := _lens(camera)) and lens.model in unbent}):
+        notes.append(f"the project of the checkpoint takes lenses that bend ({', '.join(models)}) for pinholes: photographs are not undistorted")
     return Scene(tuple(cameras), photographs, path, notes, points=_points(model), lenses=lenses)
+
+
+def unbent_by(cfg: dict[str, Any]) -> set[str]:
+    """The models of lenses that bend which the project with these cfg_args takes for pinholes."""
+    return {model for option, models in UNBENT.items() if option in cfg for model in models}
 
 
 def is_colmap(path: Path) -> bool:
@@ -124,8 +135,10 @@ def _whole_names(path: Path) -> dict[int, str]:
     return {int(row[0]): row[9] for row in fields if len(row) > 9}
 
 
-def _lens(camera: pycolmap.Camera) -> Lens | None:
-    """The lens of a camera with distortion; None for a pinhole."""
+def _lens(camera: pycolmap.Camera, unbent: Collection[str] = ()) -> Lens | None:
+    """The lens of a camera with distortion; None for a pinhole, and for a model that is taken for one."""
+    if camera.model.name in unbent:
+        return None
     distorted = any(camera.params[i] != 0 for i in camera.extra_params_idxs())
     if not distorted and "FISHEYE" not in camera.model.name and camera.model.name != "FOV":
         return None
