@@ -83,6 +83,19 @@ def test_photographs_of_another_folder_keep_the_field_of_view(tmp_path):
     assert scene.points is None
 
 
+@pytest.mark.parametrize("cfg", [None, {"images": "images", "eval": True}])
+def test_copies_are_the_photographs_where_there_are_no_others(tmp_path, cfg):
+    """mip-NeRF 360 has images_4 and images_8, and large photographs beside them that people delete. Sizes stay those of the training."""
+    write_text_model(tmp_path / "sparse/0", names(2), "SIMPLE_RADIAL", "70 32 24 0.1")
+    write_photographs(tmp_path / "images_8", names(2), size=(8, 6))
+    write_photographs(tmp_path / "images_4", names(1), size=(16, 12))
+    scene = load_scene(tmp_path, cfg)
+    assert {camera.size for camera in scene.cameras} == {(45, 61)} and {camera.fx for camera in scene.cameras} == {70}
+    assert list(scene.images.values()) == [tmp_path / "images_4/000.png"] and scene.smaller(8) == (8, 6)
+    assert scene.image(scene.cameras[0], (0, 0, 0)).shape == (10, 14, 3)
+    assert any(note == "there is no folder images: the photographs are those of images_4" for note in scene.notes)
+
+
 def test_photographs_that_were_turned_are_refused(tmp_path):
     write_text_model(tmp_path / "sparse/0", ["a.png"])
     write_photographs(tmp_path / "images", ["a.png"], size=(48, 64))

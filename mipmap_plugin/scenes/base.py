@@ -101,7 +101,7 @@ class Scene:
             within = folder.with_name(name) / first.relative_to(folder)
             for copy in (within, within.with_suffix(".png")):
                 if is_file(copy):
-                    return _undistorted_size(image_size(copy), first, camera) if first in self.lenses else image_size(copy)
+                    return _undistorted_size(image_size(copy), self.lenses[first], camera) if first in self.lenses else image_size(copy)
         return None
 
     def image(self, camera: Camera, background: Sequence[float]) -> Tensor:
@@ -133,7 +133,7 @@ def refuse_other_shape(stated: tuple[int, int], photograph: tuple[int, int], whe
         raise SceneError(f"{where}: its camera is of {wide} x {high} px, but the photograph has {width} x {height} px: {advice}")
 
 
-def _undistorted_size(size: tuple[int, int], whole: Path, camera: Camera) -> tuple[int, int]:
+def _undistorted_size(size: tuple[int, int], whole: Lens, camera: Camera) -> tuple[int, int]:
     """`size` of a copy, scaled by the ratio of the undistorted `camera` to the `whole` photograph."""
-    across, down = (kept / side for kept, side in zip((camera.width, camera.height), image_size(whole), strict=True))
+    across, down = camera.width / whole.width, camera.height / whole.height
     return max(1, round(size[0] * across)), max(1, round(size[1] * down))
