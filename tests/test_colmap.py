@@ -80,7 +80,7 @@ def test_photographs_of_another_folder_keep_the_field_of_view(tmp_path):
     assert there.size == absent.size == (24, 32)  # the absent one by the name of its folder
     assert (there.fx, there.fy) == (absent.fx, absent.fy) == (35, 36)
     assert list(scene.images) == [there]
-    assert scene.points is None
+    assert scene.points is None and scene.numbers == (1, 2)
 
 
 @pytest.mark.parametrize("cfg", [None, {"images": "images", "eval": True}])

@@ -40,6 +40,7 @@ class Scene:
         applied: [4, 4] float64, transform that nerfstudio applied to COLMAP's world before it wrote the file.
         applied_scale: The scale that it applied then.
         lenses: Of photographs that have to be undistorted.
+        numbers: COLMAP's numbers of the cameras' images, in whatever order they were found; () elsewhere.
     """
 
     cameras: tuple[Camera, ...]
@@ -50,6 +51,7 @@ class Scene:
     applied: Tensor | None = None
     applied_scale: float = 1.0
     lenses: dict[Path, Lens] = field(default_factory=dict)
+    numbers: tuple[int, ...] = ()
 
     def digest(self) -> str:
         """A hash of the cameras and of the photographs: of their names and sizes in bytes, not of what they show."""

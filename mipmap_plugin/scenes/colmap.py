@@ -86,7 +86,8 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         notes.append(f"there is no folder {photographs_folder(cfg)}: the photographs are those of {folder.name}")
     if models := sorted({lens.model for camera in model.cameras.values() if (lens := _lens(camera)) and lens.model in unbent}):
         notes.append(f"the project of the checkpoint takes lenses that bend ({', '.join(models)}) for pinholes: photographs are not undistorted")
-    return Scene(tuple(cameras), photographs, path, notes, points=_points(model), lenses=lenses)
+    numbers = tuple(image.image_id for image in images)
+    return Scene(tuple(cameras), photographs, path, notes, points=_points(model), lenses=lenses, numbers=numbers)
 
 
 def unbent_by(cfg: dict[str, Any]) -> set[str]:

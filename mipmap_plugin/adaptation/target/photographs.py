@@ -94,7 +94,7 @@ def placed(model: SplatModel, scene: Scene) -> Scene:
     if not model.traits.placed:
         return scene
     scene = scene.original()
-    capture = Capture(scene.points, scene.smaller if scene.images else None, scene.applied_scale)
+    capture = Capture(scene.points, scene.smaller if scene.images else None, scene.applied_scale, scene.numbers)
     there = scene.with_cameras(cast(Placed, model).as_trained(scene.cameras, capture))
     if [camera.split for camera in there.cameras] == [camera.split for camera in scene.cameras]:
         return there
