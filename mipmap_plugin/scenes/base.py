@@ -58,6 +58,11 @@ class Scene:
         sizes = [(path.name, path.stat().st_size) for path in self.images.values()]
         return hashlib.sha256(f"{digest_of(self.cameras)} {sizes}".encode()).hexdigest()[:DIGITS]
 
+    @property
+    def is_capture(self) -> bool:
+        """Whether it is what a scene was trained on, and not the cameras.json of a checkpoint."""
+        return bool(self.images) or self.points is not None or self.applied is not None
+
     def absent(self) -> list[str]:
         """The notes on photographs that are listed and not there: fewer views are judged than the files list."""
         return [note for note in self.notes if f" {ABSENT}" in note]
