@@ -10,6 +10,7 @@ from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.tags import provenance_of, vertical_of
+from mipmap_plugin.formats.yaml_scalars import read_scalars
 from mipmap_plugin.models.places import REPORT
 
 # How the first comment of a PLY begins that `ns-export` of nerfstudio wrote; it spells itself so.
@@ -49,9 +50,16 @@ def known_up(source: Path | None, by_family: tuple[float, float, float] | None) 
     return None if adapted_orbit(source) else by_family or vertical_of(_comments(source))
 
 
-def is_export_of_nerfstudio(source: Path | None) -> bool:
-    """Whether `ns-export` wrote a PLY, whose splats stay in the frame of their training. Raises CheckpointError for a damaged file."""
-    return any(comment.startswith(EXPORTS) for comment in _comments(source))
+def exporter(source: Path | None) -> str:
+    """The project that wrote a PLY whose splats are in a frame of its training's own; "" for any other. Raises CheckpointError for a damaged file.
+
+    `ns-export` names itself; simple_trainer of gsplat (`save_ply`) writes to the subfolder ply of its result folder.
+    """
+    if any(comment.startswith(EXPORTS) for comment in _comments(source)):
+        return "nerfstudio"
+    options = source.parent.parent / "cfg.yml" if source is not None and source.parent.name == "ply" else None
+    normalized = options is not None and options.is_file() and read_scalars(options).get("normalize_world_space") is True
+    return "gsplat" if normalized else ""
 
 
 def report_beside(source: Path | None) -> dict[str, Any]:
