@@ -393,6 +393,12 @@ def test_render_says_that_a_viewer_draws_no_such_splats(run, tmp_path):
     assert code == 0 and "spark: a network moves its splats" in err and "what its settings would make of these splats" in " ".join(err.split())
 
 
+def test_render_takes_a_folder_and_not_the_name_of_a_picture(run, model_folder, tmp_path):
+    code, _, err = run("render", model_folder, "--output", tmp_path / "view.PNG")
+    assert code == 2 and "view.PNG: pictures are written to a folder, each by the name of its view; give the folder" in err
+    assert not (tmp_path / "view.PNG").exists()
+
+
 def test_render_refuses_names_that_are_not_there_and_pictures_that_are(run, model_folder, tmp_path):
     refused(run("render", model_folder, "--output", tmp_path / "out", "--view", "nowhere"), "there is no view nowhere; the first of 4 are view_")
     words = ["render", model_folder, "--output", tmp_path / "out", "--view", "view_1"]

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from mipmap_plugin.errors import SceneError
-from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.scenes import load_photographs, load_scene
 
 pycolmap = pytest.importorskip("pycolmap", reason="COLMAP scenes are read by pycolmap, an extra")
 
@@ -80,7 +80,20 @@ def test_photographs_of_another_folder_keep_the_field_of_view(tmp_path):
     assert there.size == absent.size == (24, 32)  # the absent one by the name of its folder
     assert (there.fx, there.fy) == (absent.fx, absent.fy) == (35, 36)
     assert list(scene.images) == [there]
-    assert scene.points is None
+    assert scene.points is None and scene.numbers == (1, 2)
+
+
+@pytest.mark.parametrize("cfg", [None, {"images": "images", "eval": True}])
+def test_copies_are_the_photographs_where_there_are_no_others(tmp_path, cfg):
+    """mip-NeRF 360 has images_4 and images_8, and large photographs beside them that people delete. Sizes stay those of the training."""
+    write_text_model(tmp_path / "sparse/0", names(2), "SIMPLE_RADIAL", "70 32 24 0.1")
+    write_photographs(tmp_path / "images_8", names(2), size=(8, 6))
+    write_photographs(tmp_path / "images_4", names(1), size=(16, 12))
+    scene = load_scene(tmp_path, cfg)
+    assert {camera.size for camera in scene.cameras} == {(45, 61)} and {camera.fx for camera in scene.cameras} == {70}
+    assert list(scene.images.values()) == [tmp_path / "images_4/000.png"] and scene.smaller(8) == (8, 6)
+    assert scene.image(scene.cameras[0], (0, 0, 0)).shape == (10, 14, 3)
+    assert any(note == "there is no folder images: the photographs are those of images_4" for note in scene.notes)
 
 
 def test_photographs_that_were_turned_are_refused(tmp_path):
@@ -106,6 +119,21 @@ def test_a_checkpoint_with_cfg_args_has_its_principal_point_in_the_middle(tmp_pa
     write_text_model(tmp_path / "bent/sparse/0", names(1), "SIMPLE_RADIAL", "70 20 24 0.1")  # it was trained on the undistorted one
     camera = load_scene(tmp_path / "bent", {"eval": True}).cameras[0]
     assert (camera.cx, camera.cy) == (camera.width / 2, camera.height / 2)
+
+
+@pytest.mark.parametrize(
+    ("option", "model", "params", "size"),
+    [("n_offsets", "SIMPLE_RADIAL", "70 32 24 0.1", (48, 64)), ("kplanes_config", "OPENCV", "70 70 32 24 0.1 0 0 0", (48, 64)),
+     ("n_offsets", "OPENCV", "70 70 32 24 0.1 0 0 0", (45, 61)), ("kernel_size", "SIMPLE_RADIAL", "70 32 24 0.1", (45, 61))],
+)  # fmt: skip
+def test_some_projects_train_on_photographs_as_they_are(tmp_path, option, model, params, size):
+    """scene/dataset_readers.py of Scaffold-GS, Octree-GS and 4DGaussians; elsewhere only photographs that were undistorted before are trained on."""
+    write_text_model(tmp_path / "sparse/0", names(2), model, params)
+    write_photographs(tmp_path / "images", names(1))
+    as_it_is = size == (48, 64)
+    for scene in (load_scene(tmp_path, {option: 10, "resolution": 1}), load_photographs(tmp_path, {option: 10, "resolution": 8})):
+        assert {camera.size for camera in scene.cameras} == {size}
+        assert bool(scene.lenses) != as_it_is and any("for pinholes" in note for note in scene.notes) == as_it_is
 
 
 @pytest.mark.parametrize(

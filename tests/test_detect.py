@@ -42,6 +42,18 @@ def test_a_file_of_no_splats_is_refused(tmp_path):
         detect(write_splats(tmp_path / "a.ply", count=0))
 
 
+@pytest.mark.parametrize(
+    ("write", "part"),
+    [(torch_checkpoints.splatfacto_folder, "config.yml"), (torch_checkpoints.splatfacto_folder, "nerfstudio_models"),
+     (torch_checkpoints.gsplat_folder, "cfg.yml"), (torch_checkpoints.gsplat_folder, "ckpts"), (None, "cfg_args"), (None, "point_cloud")],
+)  # fmt: skip
+def test_a_part_of_a_model_folder_names_the_folder(tmp_path, write, part):
+    """nerfstudio's own commands take the config.yml."""
+    folder = write(tmp_path / "run", torch_checkpoints.splats()) if write else write_model_folder(tmp_path / "run")
+    with pytest.raises(CheckpointError, match=rf"run.{part} is one (file|part) of a model folder; give the folder, .*run$"):
+        detect(folder / part)
+
+
 def test_family_by_header_tag(tmp_path):
     assert detect(write(tmp_path / "a.ply", SPLAT, comments=("SplatRenderMode: 2dgs",))).family == "2dgs"
 

@@ -329,6 +329,41 @@ def test_a_job_that_travels_makes_the_same_bytes(tmp_path, given):
     assert failed.status == "failed" and "nobody" in failed.reason
 
 
+def test_files_that_are_links_travel_as_what_they_are_links_to(tmp_path):
+    """Checkpoints and photographs on another disk often are links, files and folders."""
+    disk, folder = tmp_path / "disk", tmp_path / "base"
+    model, scene = tiny.folder(disk / "model", tiny.cameras(3)), tiny.scene(tmp_path / "scene", train=tiny.cameras(2))
+    folder.mkdir()
+    for name in ("cfg_args", "cameras.json", "point_cloud"):
+        (folder / name).symlink_to(model / name)
+    (scene / "train").rename(disk / "train")
+    (scene / "train").symlink_to(disk / "train")
+    (scene / "again").symlink_to(scene)
+    job = Job(Base(folder), tmp_path / "out", 2.0, images=scene)
+    found = []
+
+    def look(job):
+        found.append((len(job.base.load().cameras), len(job.base.photographs(job.images).images)))
+        return Outcome(job, "failed")
+
+    do_parcel(pack(job), look)
+    assert found == [(3, 4)]
+
+
+def test_the_name_of_the_folder_above_a_capture_travels(tmp_path):
+    """Deformable 3D Gaussians takes the size and split of a HyperNeRF capture from it."""
+    scene = tiny.scene(tmp_path / "vrig-chicken/scene", train=tiny.cameras(1))
+    job = replace(job_of(tmp_path, images=scene), base=Base(tmp_path / "base.ply", scene))
+    above = []
+
+    def look(job):
+        above.extend(path.parent.name for path in (job.base.cameras, job.images) if (path / "transforms_train.json").is_file())
+        return Outcome(job, "failed")
+
+    do_parcel(pack(job), look)
+    assert above == ["vrig-chicken"] * 2
+
+
 def test_photographs_outside_the_folder_of_their_list_do_not_travel(tmp_path):
     scene = tiny.scene(tmp_path / "scene", train=tiny.cameras(1), count=30)
     (scene / "lists").mkdir()

@@ -138,6 +138,24 @@ def test_nerfstudio_holds_out_the_views_that_its_config_says(tmp_path, options, 
     assert [camera.name for camera in placed(load_model(tmp_path / "r"), listed).split("test")] == [cameras[0].name]
 
 
+@pytest.mark.parametrize(
+    ("options", "tests"),
+    [("assume_colmap_world_coordinate_convention: true\neval_mode: interval\neval_interval: 4", [9, 10, 6]),
+     ("assume_colmap_world_coordinate_convention: true\neval_mode: filename", [3, 9]), ("eval_mode: interval\neval_interval: 4", [0, 4, 8])],
+)  # fmt: skip
+def test_nerfstudio_orders_the_images_of_colmap_by_their_numbers(tmp_path, options, tests):
+    """COLMAP numbers images as its threads are done with them (colmap/colmap#3404)."""
+    names = [f"{number:02d}_{'eval' if number in (3, 9) else 'train'}" for number in range(11)]
+    cameras = tuple(replace(view, name=name) for name, view in zip(names, tiny.cameras(11), strict=True))
+    order = [9, 0, 2, 1, 10, 3, 5, 4, 6, 8, 7]
+    of_nerfstudio(tmp_path / "r")
+    config = tmp_path / "r/config.yml"
+    config.write_text(config.read_text() + options + "\n")
+    scene = Scene(cameras, {}, tmp_path, points=torch.zeros(1, 3), numbers=tuple(order.index(place) + 1 for place in range(11)))
+    found = placed(load_model(tmp_path / "r"), scene).split("test")
+    assert [camera.name for camera in found] == [names[number] for number in sorted(tests)]
+
+
 @pytest.mark.parametrize(("options", "width"), [({"ds": 8, "fork": 2, "resolution": -1}, 618), ({"ds": 1, "fork": 2}, 4946), ({"ds": 8}, 4946)])
 def test_octree_gs_trains_on_the_folder_that_ds_names(tmp_path, options, width):
     """scene/dataset_readers.py of Octree-GS; the option of the same name in Scaffold-GS changes nothing there."""

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import json
+import warnings
+from dataclasses import replace
 
+import moving
 import numpy as np
 import pytest
 import tiny
 import torch
 from PIL import Image
 
+from mipmap_plugin.commands.common import scene
 from mipmap_plugin.errors import SceneError
-from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.jobs.base import Base
+from mipmap_plugin.jobs.finished import _inputs
+from mipmap_plugin.jobs.job import Job
+from mipmap_plugin.scenes import load_scene, read_cameras, write_cameras
 
 
 def poses(count=4):
@@ -122,6 +129,39 @@ def test_deformable_3dgs_moves_and_scales_hypernerf_captures(tmp_path, above, sh
         assert np.allclose(camera.viewmat[:3, :3].numpy(), turn) and np.allclose(camera.viewmat[:3, 3].numpy(), wanted)
         assert (camera.width, camera.fx, camera.time) == (536 // shrunk, 500.0 / shrunk, int(camera.name) / 8)
     assert {camera.split for camera in load_scene(path, {**cfg, "eval": False}).cameras} == {"train"}
+
+
+@pytest.mark.parametrize(
+    ("tests", "trains"),
+    [([2, 6], [0, 4, 8]), ([], [0, 4, 8]), ([1, 3, 5, 7], [0, 2, 4, 6, 8]), ([0, 8], [1, 2, 3, 4, 5, 6, 7, 9])],
+    ids=["interp", "misc", "vrig", "COLMAP"],
+)  # fmt: skip
+def test_the_cameras_json_of_a_hypernerf_capture_has_its_test_views_first(tmp_path, tests, trains):
+    """Of Deformable 3D Gaussians (scene/__init__.py): another number of them than of a COLMAP scene, or none."""
+    cameras = [replace(view, name=f"{number:06d}") for number, view in zip([*tests, *trains], tiny.cameras(len(tests + trains)), strict=True)]
+    path = write_cameras(tmp_path / "cameras.json", cameras)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = read_cameras(path, {"is_6dof": False, "eval": True})
+    assert [int(camera.name) for camera in found if camera.split == "test"] == tests
+
+
+def test_photographs_judge_a_deformable_checkpoint_in_its_own_frame(tmp_path):
+    """`evaluate`, `tradeoff`, and `adapt` with `--images`, here or as a job; at their full size, whatever `resolution` it was trained at."""
+    path = hypernerf(tmp_path / "interp_aleks/s")
+    (path / "metadata.json").write_text(json.dumps({f"{i:06d}": {"warp_id": i, "time_id": 3 * i} for i in range(9)}))
+    (path / "scene.json").write_text(json.dumps({"scale": 0.25, "center": [0.5, -1.0, 2.0]}))
+    folder = moving.write_deformable(tmp_path / "model")
+    wanted = load_scene(path, {"is_6dof": False}).cameras
+    (folder / "cfg_args").write_text((folder / "cfg_args").read_text().replace("(", "(resolution=2, "))
+    base = Base(folder)
+    judged = scene(base, path)
+    assert [camera.size for camera in judged.cameras] == [camera.size for camera in wanted] == [(480, 268)] * 5
+    assert all(torch.equal(one.viewmat, other.viewmat) for one, other in zip(judged.cameras, wanted, strict=True))
+    assert [camera.time for camera in judged.cameras] == [camera.time for camera in wanted]
+    job = Job(base, tmp_path / "out", 0.5, images=path)
+    assert _inputs(job)["photographs"] == judged.digest()
+    assert scene(Base(tiny.folder(tmp_path / "still")), path).digest() == load_scene(path).digest()
 
 
 def test_broken_ones_are_refused_in_one_sentence(tmp_path):

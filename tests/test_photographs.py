@@ -122,6 +122,11 @@ def test_images_of_which_none_is_adapted_to_are_refused(scene):
         model.adapt(2, images=scene, steps=1, views="orbit")
 
 
+def test_images_that_are_smaller_than_the_training_s_are_refused(scene):
+    with pytest.raises(SettingsError, match=r"has 64 x 48 px, but the base was trained at 128 x 96 px: .* give larger photographs"):
+        Photographs(scene, tiny.cameras(3, width=128, height=96), BLACK)
+
+
 def test_a_scene_without_training_images_is_refused(tmp_path):
     model = wrap_model(tiny.model(), cameras=tiny.cameras())
     with pytest.raises(SettingsError, match="there are no training images to adapt to"):

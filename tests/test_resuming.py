@@ -14,8 +14,10 @@ from running import wait_until
 
 from mipmap_plugin.cli import main
 from mipmap_plugin.evaluation.cells import Cells
+from mipmap_plugin.evaluation.measure import adapt_alone
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.formats.torch_file import load_torch
+from mipmap_plugin.recipes import RECIPES
 
 
 @pytest.fixture
@@ -115,6 +117,23 @@ def test_rows_of_another_truth_are_measured_again(folder, monkeypatch):
         assert main([*words, "--output", str(folder / "rows.json"), "--overwrite"]) == 0
         rows.append(json.loads((folder / "rows.json").read_text())["rows"][0])
     assert rows[0]["psnr_db"] != rows[1]["psnr_db"] and rows[1] == rows[2]  # the last is not measured again
+
+
+@pytest.mark.parametrize(("command", "module"), [("evaluate", "evaluate"), ("tradeoff", "tradeoff.measuring")])
+def test_what_another_recipe_of_that_name_made_is_measured_again(folder, monkeypatch, command, module):
+    """One's own recipe, edited after an interruption."""
+    words = [command, str(folder / "base"), "--images", str(folder / "scene"), "--scale", "1/2", "--recipe", "mine"]
+    words += ["--no-picture", "--no-renderers", "--repeats", "1", "--supersampling", "2"] if command == "tradeoff" else []
+    for kept in ("commands.evaluate", "evaluation.cells"):
+        monkeypatch.setattr(f"mipmap_plugin.{kept}.shutil", SimpleNamespace(rmtree=lambda *_, **__: None))
+    made, counts = [], []
+    place = f"mipmap_plugin.evaluation.{module}.adapt_alone"
+    monkeypatch.setattr(place, lambda *args, **settings: made.append(args) or adapt_alone(*args, **settings))
+    for crispness in (0.0, 0.0, 0.5):
+        with RECIPES.temporarily(mine=lambda scale, network, value=crispness: {"steps": 0, "views": "given", "crispness": value}):
+            assert main([*words, "--output", str(folder / "rows.json"), "--overwrite"]) == 0
+        counts.append(len(made))
+    assert 0 < counts[0] == counts[1] and counts[2] == 2 * counts[0]
 
 
 def test_the_scene_is_not_replaced_by_the_rows(folder, capsys):

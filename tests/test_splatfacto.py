@@ -137,6 +137,16 @@ def test_large_photographs_were_shrunk_for_the_training(tmp_path, downscale, siz
     assert placed.size == size
 
 
+@pytest.mark.parametrize(("downscale", "ratio", "size"), [("2", "0.5", (500, 1000)), ("null", "0.7", (350, 700)), ("2", "null", (1000, 2000))])
+def test_photographs_that_the_datamanager_shrank_are_so_small(tmp_path, downscale, ratio, size):
+    folder = splatfacto_folder(tmp_path / "r", splats(), downscale=f"{downscale}\n    camera_res_scale_factor: {ratio}")
+    (folder / "dataparser_transforms.json").write_text(json.dumps(TRANSFORMS))
+    [camera] = tiny.cameras(1, width=4000, height=2000)
+    [placed] = load_model(folder).as_trained([camera], Capture())
+    assert placed.size == size
+    assert placed.fx == pytest.approx(camera.fx * size[1] / 4000)
+
+
 @pytest.mark.parametrize("content", [None, "{", '{"scale": 1}', '{"scale": 1, "transform": [[1, 0], [0, 1]]}', '{"scale": "a", "transform": []}'])
 def test_without_its_transform_the_cameras_cannot_be_placed(tmp_path, content):
     folder = splatfacto_folder(tmp_path / "r", splats())

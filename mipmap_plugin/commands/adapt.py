@@ -102,7 +102,7 @@ def adapt(
     left = [file for file in files if file[:2] not in before]
     _check(wrapped, left, settings, overwrite)
     page = AdaptationPage(checkpoint, [target for *_, target in files], overwrite) if report else None
-    models = _adapted(wrapped, left, settings | dict(images=images and scene(images)))
+    models = _adapted(wrapped, left, settings | dict(images=images and scene(replace(base, checkpoint=checkpoint), images)))
     made = _save_all(wrapped, models, page, overwrite, quiet=json)
     if page:
         page.write(made, [*before.values()])

@@ -52,11 +52,9 @@ def base_cameras(wrapped: Wrapped, given: Path | None) -> str:
     return "" if given is not None or place in own else place
 
 
-def scene(path: Path) -> Scene:
-    """The scene at `path`, whose photographs judge; a warning tells of absent ones. Raises SceneError."""
-    from mipmap_plugin.scenes import load_scene
-
-    read = load_scene(path)
+def scene(base: Base, path: Path) -> Scene:
+    """The scene at `path`, whose photographs judge a checkpoint; a warning tells of absent ones. Raises CheckpointError, SceneError."""
+    read = base.photographs(path)
     for note in read.absent():
         warnings.warn(f"{path}: {note}", stacklevel=2)
     return read

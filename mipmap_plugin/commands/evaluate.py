@@ -81,7 +81,8 @@ def evaluate(
     results = _Results(protocol, _perceptual(lpips, lpips_weights), unique_scales(scale), page, output)
     with results.resumable():
         for name, path, folder, own in zip(_names(checkpoint, images), checkpoint, images, cameras or [None] * len(checkpoint), strict=True):
-            wrapped, photographs = wrap(Base(path, own, background, backend, screen_filter), threads), _scene(folder, appearance)
+            base = Base(path, own, background, backend, screen_filter)
+            wrapped, photographs = wrap(base, threads), _scene(base, folder, appearance)
             results.measure(name, wrapped, photographs, appearance, recipe, settings)
     facts = results.write(checkpoint, output, overwrite)
     print_facts(facts, json) if json else results.print_tables(_title(checkpoint, images, protocol, results.judged), published)
@@ -163,8 +164,8 @@ def _names(checkpoints: Sequence[Path], images: Sequence[Path]) -> list[str]:
     return [scene if scenes.count(scene) == 1 else f"{scene}, {path}" for scene, path in zip(scenes, checkpoints, strict=True)]
 
 
-def _scene(folder: Path, appearance: str) -> Scene:
-    read = scene(folder)
+def _scene(base: Base, folder: Path, appearance: str) -> Scene:
+    read = scene(base, folder)
     return read.numbered_as_upstream() if appearance == "upstream" else read
 
 

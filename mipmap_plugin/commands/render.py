@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from mipmap_plugin.camera import Camera
     from mipmap_plugin.wrap import RenderOptions, Wrapped
 
+# Endings of pictures, which no folder is called by.
+PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
+
 
 def render(
     checkpoint: Checkpoint,
@@ -63,7 +66,7 @@ def render(
         exposure: Apply the exposure of each view's photograph, if the training learned one (exposure.json of 3DGS).
         overwrite: Replace pictures that exist.
     """
-    wrapped = wrap(Base(checkpoint, cameras, background, backend, up=up))
+    output, wrapped = _folder(output), wrap(Base(checkpoint, cameras, background, backend, up=up))
     zoom, views = _zoom(wrapped, scale), _at_times(wrapped, _named(wrapped, view), time)
     filter_name = None if screen_filter == "trained" else screen_filter
     own_viewer = _own_viewer(wrapped) if viewer is None and filter_name is None else None
@@ -138,6 +141,13 @@ def _own_viewer(wrapped: Wrapped) -> str | None:
         remedy = "install the package that adds it, or give another one (--viewer) or a screen filter (--screen-filter)"
         raise SettingsError(f"{wrapped.model.source} was adapted for the viewer {viewer!r}, which is not installed here; {remedy}")
     return viewer if viewer and len(viewers_for(viewer)) == 1 else None
+
+
+def _folder(output: Path) -> Path:
+    """The folder for the pictures. Raises SettingsError for what is the name of one picture."""
+    if output.suffix.lower() in PICTURES and not output.is_dir():
+        raise SettingsError(f"{output}: pictures are written to a folder, each by the name of its view; give the folder")
+    return output
 
 
 def _refuse(wrapped: Wrapped, pictures: Sequence[Path], outputs: Sequence[str], overwrite: bool) -> None:

@@ -216,8 +216,9 @@ def _adapted_rows(model: Wrapped, judge: Evaluator, scale: float, recipes: Seque
         adapted = adapt_alone(model, scale, recipe=name, **own)
         return adapted_row(f"{name}, {'scored' if on == 'scored' else _unseen(judge.views, adapted)}", adapted, judge)
 
+    made = {name: config_of(name, scale, settings).model_dump() for name in recipes}  # a registered recipe may have been edited since
     each = product(recipes, ("train", "scored"))
-    return [judge.cell({"recipe": name, "on": on, "scale": scale}, partial(row, name, on)) for name, on in each]
+    return [judge.cell({"recipe": name, "made": made[name], "on": on, "scale": scale}, partial(row, name, on)) for name, on in each]
 
 
 def _views(config: AdaptConfig, on: str, judged: Sequence[TruthView]) -> dict[str, Any]:

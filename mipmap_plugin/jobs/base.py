@@ -12,6 +12,7 @@ from mipmap_plugin.process.garbage import uncollected
 
 if TYPE_CHECKING:
     from mipmap_plugin.camera import Camera
+    from mipmap_plugin.scenes import Scene
     from mipmap_plugin.wrap import Wrapped
 
 COLORS = {None: None, "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
@@ -43,6 +44,13 @@ class Base:
             own, _ = own_cameras(detect(self.checkpoint).path, folder)
             cameras = own if isinstance(own, list) else own.cameras
         return asked_for(folder, cameras, COLORS[self.background], self.screen_filter, self.up)
+
+    def photographs(self, path: Path) -> Scene:
+        """The scene at `path`, to whose photographs the checkpoint is compared or adapted. Raises CheckpointError, SceneError."""
+        from mipmap_plugin.models.inria_folder import read_options
+        from mipmap_plugin.scenes import load_photographs
+
+        return load_photographs(path, read_options(self._model_folder())[0])
 
     def unpacked(self) -> Base:
         """The same checkpoint, for another process: this one removes what it unpacked when it ends, but a worker that is killed does not."""

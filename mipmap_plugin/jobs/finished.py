@@ -21,7 +21,6 @@ from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.models import detect
 from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.recipes import recipe
-from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.splatting.viewers import viewers_for
 
 
@@ -76,7 +75,7 @@ def _is_requested(provenance: dict[str, Any], job: Job) -> bool:
 
 def _inputs(job: Job) -> dict[str, str]:
     """What is given beside the checkpoint: a hash of the cameras, the background, the screen filter, and a hash of the photographs."""
-    return job.base.asked() | ({} if job.images is None else {"photographs": load_scene(job.images).digest()})
+    return job.base.asked() | ({} if job.images is None else {"photographs": job.base.photographs(job.images).digest()})
 
 
 def _digest(job: Job, wanted: Any, may_load: bool) -> str:

@@ -6,7 +6,7 @@ import io
 import os
 import tarfile
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -119,10 +119,20 @@ def _write(archive: tarfile.TarFile, member: tarfile.TarInfo, place: Path, job: 
 
 def _scene(path: Path, folder: Path) -> dict[Path, Path]:
     """The files of a scene, by their names in the archive: a file, a model folder's cameras and options, or the folder with its photographs."""
-    file = path if path.is_file() else path / "cameras.json"
+    packed = _packed(path, folder)
+    file, within = (path, packed.parent) if path.is_file() else (path / "cameras.json", packed)
     if file.is_file():
-        return {folder / each.name: each for each in (file, file.with_name(OPTIONS)) if each.is_file()}
-    return {folder / file.relative_to(path): file for file in path.rglob("*") if file.is_file()}
+        return {within / each.name: each for each in (file, file.with_name(OPTIONS)) if each.is_file()}
+    return {within / file.relative_to(path): file for file in _files(path)}
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """All files below a folder, also in links to folders, as photographs often are, but not in those to where they lie in."""
+    for entry in sorted(folder.iterdir()):
+        if entry.is_file():
+            yield entry
+        elif entry.is_dir() and not (entry.is_symlink() and folder.resolve().is_relative_to(entry.resolve())):
+            yield from _files(entry)
 
 
 def _photographs(path: Path, folder: Path) -> dict[Path, Path]:
@@ -136,12 +146,13 @@ def _photographs(path: Path, folder: Path) -> dict[Path, Path]:
 
 
 def _packed(path: Path, folder: Path) -> Path:
-    return folder / path.name if path.is_file() else folder
+    """Where a scene is in the archive. The name of the folder above is kept, for it says which capture of HyperNeRF it is (`scenes.moving`)."""
+    return folder / path.name if path.is_file() else folder / path.absolute().parent.name / "scene"
 
 
 def _archive(members: Mapping[Path, Path]) -> bytes:
     stream = io.BytesIO()
-    with tarfile.open(fileobj=stream, mode="w") as archive:
+    with tarfile.open(fileobj=stream, mode="w", dereference=True) as archive:
         for name, file in members.items():
             archive.add(file, name.as_posix(), recursive=False)
     return stream.getvalue()

@@ -12,7 +12,6 @@ from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.limits import is_out_of_memory
 from mipmap_plugin.models.places import state_path
 from mipmap_plugin.models.zipped_folder import told
-from mipmap_plugin.scenes import load_scene
 
 
 def run(job: Job, threads: int | None = None) -> Outcome:
@@ -48,7 +47,7 @@ def _adapt(job: Job, threads: int | None) -> Outcome:
     base.targets(job.viewer)
     networks_move = config.steps > 0 and config.rates.networks > 0
     base.refuse_output(job.target, overwrite=job.overwrite, networks_move=networks_move, viewer=job.viewer)
-    scene = None if job.images is None else load_scene(job.images)
+    scene = None if job.images is None else job.base.photographs(job.images)
     adapted = base.adapt(job.scale, recipe=job.recipe, viewer=job.viewer, resume=state_path(job.target), images=scene, **job.settings)
     file = adapted.save(job.target, overwrite=job.overwrite)
     return Outcome(job, "done", file, adapted.report_of(file).model_dump())

@@ -12,7 +12,7 @@ from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import OF_SPLATS, Family, Files, Match
-from mipmap_plugin.models.places import REPORT
+from mipmap_plugin.models.places import PARTS, REPORT
 from mipmap_plugin.models.zipped_folder import opened, told_of_archives
 
 # Suffixes of files of splats besides PLY, and of photographs.
@@ -143,6 +143,8 @@ def _why_not(files: Files) -> str:
     if path.suffix == ".hier":
         chunk = "the PLY of one of its chunks (trained_chunks/<name>/point_cloud/iteration_<N>)"
         return f"{path} is a hierarchy of Hierarchical 3D Gaussians, whose splats follow the distance, which is not read here; give {chunk}"
+    if kind == "unknown" and _is_whole(path.parent):  # as nerfstudio's commands take the config.yml
+        return f"{path} is one file of a model folder; give the folder, {path.parent}"
     return {
         "torchscript": f"{path} is a TorchScript network, one companion of an anchor model; give the model folder that holds its point_cloud.ply",
         "zip": f"{path} is a zip archive; unpack it and give the PLY or the folder in it",
@@ -164,6 +166,8 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
         clouds = [folder / "point_cloud.ply"]
     if len(clouds) == 1:
         return detect(clouds[0])
+    if not clouds and folder.name in PARTS and _is_whole(folder.parent):
+        raise CheckpointError(f"{folder} is one part of a model folder; give the folder, {folder.parent}")
     some = ", ".join([*(cloud.name for cloud in clouds[:5]), *["..."] * (len(clouds) > 5)])
     if not clouds and (below := _below(folder)):
         more = ", ..." if len(below) > NAMED else ""
@@ -196,10 +200,15 @@ def _below(folder: Path) -> list[Path]:
     for _ in range(DEPTH):
         below = [each for parent in level for each in _folders_in(parent)][: MOST_LOOKED_AT - looked_at]
         looked_at += len(below)
-        holding = [each for each in below if (each / "point_cloud").is_dir() or any(_has_place(each, name) for name in FAMILIES.names())]
+        holding = [each for each in below if _is_whole(each)]
         found += sorted(holding, reverse=True)
         level = [each for each in below if each not in holding]
     return found
+
+
+def _is_whole(folder: Path) -> bool:
+    """Whether a folder is a model folder."""
+    return (folder / "point_cloud").is_dir() or any(_has_place(folder, name) for name in FAMILIES.names())
 
 
 def _folders_in(folder: Path) -> list[Path]:

@@ -19,6 +19,7 @@ class Capture:
     points: Tensor | None = None  # [P, 3] of structure from motion
     smaller: Callable[[int], tuple[int, int] | None] | None = None  # (width, height) px of the copies in images_<factor>; None: no photographs
     applied_scale: float = 1.0  # scale that nerfstudio applied to COLMAP's world before it wrote the file
+    numbers: Sequence[int] = ()  # COLMAP's, of the cameras' images
 
 
 class Host(Protocol):
@@ -49,8 +50,9 @@ def as_file(name: str) -> str:
     return f"{name}."
 
 
-def held_out(cameras: Sequence[Camera], tests: Collection[int]) -> list[Camera]:
-    """The cameras, of which those at the places `tests` in the order of their files' names are for testing, and all others for training."""
-    by_name = sorted(range(len(cameras)), key=lambda number: as_file(cameras[number].name))
-    chosen = {by_name[place] for place in tests}
+def held_out(cameras: Sequence[Camera], tests: Collection[int], numbers: Sequence[int] = ()) -> list[Camera]:
+    """The cameras, of which those at the places `tests` in the order of their `numbers`, or else of their files' names, are for testing, and all
+    others for training."""
+    ordered = sorted(range(len(cameras)), key=lambda place: numbers[place] if numbers else as_file(cameras[place].name))
+    chosen = {ordered[place] for place in tests}
     return [replace(camera, split="test" if number in chosen else "train") for number, camera in enumerate(cameras)]

@@ -45,6 +45,9 @@ UP = (0.0, 0.0, 1.0)
 # Background of renders by option `background_color`; after training on "random" colors it is the last one.
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": (0.1490, 0.1647, 0.2157)}
 
+# An option of the dataparser that reads COLMAP's own files, in the order of the images' numbers, which is often not that of their names.
+OF_COLMAP = "assume_colmap_world_coordinate_convention"
+
 # px: larger photographs are halved until they fit (data/dataparsers/nerfstudio_dataparser.py).
 MAX_SIDE = 1600
 
@@ -87,11 +90,15 @@ class SplatfactoHost:
         names = [camera.name for camera in cameras]
         said = any(camera.split == "test" for camera in cameras) if capture.points is None else "eval_mode" not in self.options
         if not said and len(set(names)) == len(names):
-            cameras = held_out(cameras, _tests(names, self.options))
+            by_number = capture.numbers if OF_COLMAP in self.options else ()
+            ordered = [name for _, name in sorted(zip(by_number, names, strict=True))] if by_number else sorted(names, key=as_file)
+            cameras = held_out(cameras, _tests(ordered, self.options), by_number)
         frame = self._frame()
         frame[:3] /= capture.applied_scale  # contained in the file's scale, but already applied to the poses
         factor = _factor(cameras, self.options.get("downscale_factor"), capture)
-        return [_shrunk(camera, factor).moved(frame) for camera in cameras]
+        ratio = self.options.get("camera_res_scale_factor")  # the datamanager resizes what the dataparser found
+        again = 1 / ratio if isinstance(ratio, (int, float)) and ratio > 0 else 1.0
+        return [_shrunk(_shrunk(camera, factor), again).moved(frame) for camera in cameras]
 
     def _content(self, parameters: dict[str, Tensor], comments: Sequence[str]) -> dict[str, Any]:
         content = load_torch(self.source)
@@ -189,7 +196,7 @@ def _unusual_options(pipeline: Mapping[str, Any], options: dict[str, Any]) -> li
 
 
 def _tests(names: list[str], options: dict[str, Any]) -> list[int]:
-    """The places of the test views in the order of `names` (data/utils/dataparsers_utils.py); none if the config does not tell."""
+    """The places of the test views among `names` in the training's order (data/utils/dataparsers_utils.py); none if the config does not tell."""
     count, interval, share = len(names), options.get("eval_interval", 8), options.get("train_split_fraction")
     match options.get("eval_mode"):
         case "fraction" if isinstance(share, (int, float)) and 0 < share <= 1:
@@ -197,7 +204,7 @@ def _tests(names: list[str], options: dict[str, Any]) -> list[int]:
         case "interval" if isinstance(interval, int) and interval > 0:
             return list(range(0, count, interval))
         case "filename":
-            return [place for place, name in enumerate(sorted(names, key=as_file)) if "eval" in name and "train" not in name]
+            return [place for place, name in enumerate(names) if "eval" in name and "train" not in name]
     return []
 
 

@@ -11,8 +11,8 @@ from mipmap_plugin.formats.cfg_args import read_cfg_args
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.scenes.base import Scene
-from mipmap_plugin.scenes.cameras_json import read_cameras, write_cameras
-from mipmap_plugin.scenes.colmap import is_colmap, read_colmap
+from mipmap_plugin.scenes.cameras_json import DEFORMABLE, read_cameras, write_cameras
+from mipmap_plugin.scenes.colmap import UNBENT, is_colmap, read_colmap, unbent_by
 from mipmap_plugin.scenes.in_ply import cameras_in
 from mipmap_plugin.scenes.moving import is_dynerf, is_hypernerf, read_dynerf, read_hypernerf
 from mipmap_plugin.scenes.orbits import orbit
@@ -26,8 +26,8 @@ OPTIONS = "cfg_args"
 COLMAP_FILES = {f"{name}{suffix}" for name in ("cameras", "images", "points3D", "frames", "rigs") for suffix in (".bin", ".txt")}
 
 __all__ = [
-    "Scene", "cameras_in", "jittered", "load_scene", "model_cameras", "orbit", "read_cameras", "read_colmap", "read_transforms", "unread_cameras",
-    "write_cameras",
+    "Scene", "cameras_in", "jittered", "load_photographs", "load_scene", "model_cameras", "orbit", "read_cameras", "read_colmap", "read_transforms",
+    "unread_cameras", "write_cameras",
 ]  # fmt: skip
 
 
@@ -60,6 +60,18 @@ def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         return read_colmap(path, cfg)
     advice = f"give the folder or file that has the cameras{f', such as {found[0]}' if (found := _near(path)) else ''}"
     raise SceneError(f"{path}: holds neither cameras.json nor transforms files nor a COLMAP model; {advice}")
+
+
+def load_photographs(path: str | Path, cfg: dict[str, Any]) -> Scene:
+    """The scene at `path` with photographs at their own size, whatever size a checkpoint with these cfg_args was trained at.
+
+    Only those options count by which Deformable 3D Gaussians moves and scales HyperNeRF's captures, and others take lenses of COLMAP for pinholes.
+    Raises SceneError.
+    """
+    path = path_of(path)
+    if DEFORMABLE in cfg and is_hypernerf(path):
+        return load_scene(path, {**cfg, "resolution": 1})
+    return load_scene(path, {name: cfg[name] for name in (*UNBENT, "eval") if name in cfg} if unbent_by(cfg) and is_colmap(path) else None)
 
 
 def model_cameras(folder: str | Path | None, cfg: dict[str, Any] | None = None) -> list[Camera]:

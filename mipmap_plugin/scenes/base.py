@@ -40,6 +40,7 @@ class Scene:
         applied: [4, 4] float64, transform that nerfstudio applied to COLMAP's world before it wrote the file.
         applied_scale: The scale that it applied then.
         lenses: Of photographs that have to be undistorted.
+        numbers: COLMAP's numbers of the cameras' images, in whatever order they were found; () elsewhere.
     """
 
     cameras: tuple[Camera, ...]
@@ -50,11 +51,17 @@ class Scene:
     applied: Tensor | None = None
     applied_scale: float = 1.0
     lenses: dict[Path, Lens] = field(default_factory=dict)
+    numbers: tuple[int, ...] = ()
 
     def digest(self) -> str:
         """A hash of the cameras and of the photographs: of their names and sizes in bytes, not of what they show."""
         sizes = [(path.name, path.stat().st_size) for path in self.images.values()]
         return hashlib.sha256(f"{digest_of(self.cameras)} {sizes}".encode()).hexdigest()[:DIGITS]
+
+    @property
+    def is_capture(self) -> bool:
+        """Whether it is what a scene was trained on, and not the cameras.json of a checkpoint."""
+        return bool(self.images) or self.points is not None or self.applied is not None
 
     def absent(self) -> list[str]:
         """The notes on photographs that are listed and not there: fewer views are judged than the files list."""
@@ -101,7 +108,7 @@ class Scene:
             within = folder.with_name(name) / first.relative_to(folder)
             for copy in (within, within.with_suffix(".png")):
                 if is_file(copy):
-                    return _undistorted_size(image_size(copy), first, camera) if first in self.lenses else image_size(copy)
+                    return _undistorted_size(image_size(copy), self.lenses[first], camera) if first in self.lenses else image_size(copy)
         return None
 
     def image(self, camera: Camera, background: Sequence[float]) -> Tensor:
@@ -133,7 +140,7 @@ def refuse_other_shape(stated: tuple[int, int], photograph: tuple[int, int], whe
         raise SceneError(f"{where}: its camera is of {wide} x {high} px, but the photograph has {width} x {height} px: {advice}")
 
 
-def _undistorted_size(size: tuple[int, int], whole: Path, camera: Camera) -> tuple[int, int]:
+def _undistorted_size(size: tuple[int, int], whole: Lens, camera: Camera) -> tuple[int, int]:
     """`size` of a copy, scaled by the ratio of the undistorted `camera` to the `whole` photograph."""
-    across, down = (kept / side for kept, side in zip((camera.width, camera.height), image_size(whole), strict=True))
+    across, down = camera.width / whole.width, camera.height / whole.height
     return max(1, round(size[0] * across)), max(1, round(size[1] * down))

@@ -20,6 +20,9 @@ from mipmap_plugin.limits import path_of
 # INRIA's reader holds out every eighth photograph of a COLMAP scene.
 TEST_EVERY = 8
 
+# An option in the cfg_args of Deformable 3D Gaussians that no other project has which reads captures of HyperNeRF.
+DEFORMABLE = "is_6dof"
+
 # `-r`: these divide the size; -1 caps the width; any other number is a width.
 DIVISORS = (1, 2, 4, 8)
 WIDTH_CAP = 1600  # px
@@ -42,7 +45,7 @@ def read_cameras(path: str | Path, cfg: dict[str, Any] | None = None) -> list[Ca
         lacks = "lists no cameras" if entries == [] else "is not a list of cameras"
         raise SceneError(f"{path}: {lacks}; give the cameras.json that lies beside the checkpoint")
     names = [_name(entry, f"{path}, entry {index}") for index, entry in enumerate(entries)]
-    tests, trained = _tests(names, path) if cfg.get("eval") else set(), count()
+    tests, trained = _tests(names, path, cfg) if cfg.get("eval") else set(), count()
     cameras = []
     for index, (entry, name) in enumerate(zip(entries, names, strict=True)):
         camera = _camera(entry, name, "test" if index in tests else "train", f"{path}, entry {index} ({name})")
@@ -70,7 +73,7 @@ def _entry(index: int, camera: Camera) -> dict[str, Any]:
     return {"id": index, "img_name": camera.name, "width": camera.width, "height": camera.height, **where, **lens}
 
 
-def _tests(names: list[str], path: Path) -> set[int]:
+def _tests(names: list[str], path: Path, cfg: dict[str, Any]) -> set[int]:
     """The places of the test cameras in a file with these names: the first ones, as INRIA writes it, or every eighth of a file sorted by name.
 
     INRIA's readers hold out every eighth name of a COLMAP scene, and write these first, which no longer is the order of names. They sort names as
@@ -83,6 +86,8 @@ def _tests(names: list[str], path: Path) -> set[int]:
     alike = len(set(numberless)) <= len(names) / 2  # otherwise names say nothing by what they begin with
     if len(set(names)) < len(names) or (alike and not {*numberless[:first]} & {*numberless[first:]}):  # Blender's, and test_0 and train_0
         return leading
+    if DEFORMABLE in cfg and len(ends := [place for place in range(1, len(names)) if names[place] < names[place - 1]]) <= 1:
+        return set(range(ends[0] if ends else 0))  # of HyperNeRF: any number of test views, or none, and then those of training, each in their order
     if names == by_name:
         return set(range(0, len(names), TEST_EVERY))
     if {*names[:first]} != {*by_name[::TEST_EVERY]}:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Collection
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -28,20 +30,24 @@ MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".", "0")  # the last: the fo
 # Folders between a model and the folder of photographs, which is beside the highest: nerfstudio has all of them.
 BETWEEN = ("0", "sparse", "colmap")
 
+# An option in the cfg_args of Scaffold-GS and Octree-GS, and one of 4DGaussians; and the lenses that bend which these take for pinholes.
+UNBENT = {"n_offsets": ("SIMPLE_RADIAL",), "kplanes_config": ("SIMPLE_RADIAL", "OPENCV")}
+
 
 def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     """The scene of a folder with `sparse/0` and images, or of the folder of the model itself.
 
     `cfg` is the checkpoint's cfg_args: `images` names the folder of photographs and `resolution` the training size; the principal
-    point is moved to the center, as projects with cfg_args do. Without it, the photographs in `images` are used at their full
-    size. A camera whose photograph is missing stays a usable view; `notes` count them.
+    point is moved to the center, as projects with cfg_args do, and lenses that the project takes for pinholes are (`UNBENT`). Without it, the
+    photographs in `images` are used at their full size; where only copies are there (images_4), their cameras keep the full size. A camera whose
+    photograph is missing stays a usable view; `notes` count them.
 
     Raises:
         SceneError: no pycolmap, no readable model, a lens that cannot be undistorted, or an invalid `resolution`.
     """
     path, cfg = Path(path), cfg or {}
     model = _read(path)
-    folder = _photographs(path, photographs_folder(cfg))
+    folder, is_copy = _photographs(path, photographs_folder(cfg))
     try:
         whole = _whole_names(path)
         for number, image in model.images.items():
@@ -56,14 +62,15 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     cameras: list[Camera] = []
     photographs: dict[Camera, Path] = {}
     lenses: dict[Path, Lens] = {}
-    trained = count()
+    trained, unbent = count(), unbent_by(cfg)
     for index, image in enumerate(images):
         camera = _camera(model, image, "train" if index % TEST_EVERY else "test", centered=bool(cfg))
-        photograph, lens = folder / image.name, _lens(model.cameras[image.camera_id])
+        photograph, lens = folder / image.name, _lens(model.cameras[image.camera_id], unbent)
         exists, options = is_file(photograph), cfg
         if exists:
-            size, options = image_size(photograph), {**cfg, "images": "images", "ds": 1}
-            refuse_other_shape((camera.width, camera.height), size, str(photograph))
+            refuse_other_shape((camera.width, camera.height), size := image_size(photograph), str(photograph))
+        if exists and not is_copy:
+            options = {**cfg, "images": "images", "ds": 1}
             camera, lens = camera.resized(*size), lens and lens.at(size)
         if lens is not None:
             camera, lenses[photograph] = lens.straightened(camera), lens
@@ -75,7 +82,17 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         if exists:
             photographs[camera] = photograph
     notes = _notes(cameras, photographs, folder, cfg) + ([note(lenses.values())] if lenses else [])
-    return Scene(tuple(cameras), photographs, path, notes, points=_points(model), lenses=lenses)
+    if is_copy:
+        notes.append(f"there is no folder {photographs_folder(cfg)}: the photographs are those of {folder.name}")
+    if models := sorted({lens.model for camera in model.cameras.values() if (lens := _lens(camera)) and lens.model in unbent}):
+        notes.append(f"the project of the checkpoint takes lenses that bend ({', '.join(models)}) for pinholes: photographs are not undistorted")
+    numbers = tuple(image.image_id for image in images)
+    return Scene(tuple(cameras), photographs, path, notes, points=_points(model), lenses=lenses, numbers=numbers)
+
+
+def unbent_by(cfg: dict[str, Any]) -> set[str]:
+    """The models of lenses that bend which the project with these cfg_args takes for pinholes."""
+    return {model for option, models in UNBENT.items() if option in cfg for model in models}
 
 
 def is_colmap(path: Path) -> bool:
@@ -88,13 +105,17 @@ def _model_folder(path: Path) -> Path | None:
     return next((place for place in places if any((place / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))), None)
 
 
-def _photographs(path: Path, name: str) -> Path:
-    """The folder `name` of photographs: beside the model, or above it, whichever of these folders was given."""
+def _photographs(path: Path, name: str) -> tuple[Path, bool]:
+    """The folder `name` of photographs: beside the model, or above it, whichever of these folders was given. Where there is none, the folder of the
+    largest copies (images_2, images_4, ...), and True."""
     above = [here := (_model_folder(path) or path).absolute(), here.parent]
     while above[-1].name in BETWEEN:
         above.append(above[-1].parent)
     usual = next((place.parent for place in above if place.name == "sparse"), path)  # if there is none
-    return next((place / name for place in above if (place / name).is_dir()), usual / name)
+    if found := next((place / name for place in above if (place / name).is_dir()), None):
+        return found, False
+    copies = {int(match[1]): copy for place in above for copy in place.glob("images_*") if (match := re.fullmatch(r"images_(\d{1,9})", copy.name))}
+    return (copies[min(copies)], True) if copies else (usual / name, False)
 
 
 def _read(path: Path) -> pycolmap.Reconstruction:
@@ -124,8 +145,10 @@ def _whole_names(path: Path) -> dict[int, str]:
     return {int(row[0]): row[9] for row in fields if len(row) > 9}
 
 
-def _lens(camera: pycolmap.Camera) -> Lens | None:
-    """The lens of a camera with distortion; None for a pinhole."""
+def _lens(camera: pycolmap.Camera, unbent: Collection[str] = ()) -> Lens | None:
+    """The lens of a camera with distortion; None for a pinhole, and for a model that is taken for one."""
+    if camera.model.name in unbent:
+        return None
     distorted = any(camera.params[i] != 0 for i in camera.extra_params_idxs())
     if not distorted and "FISHEYE" not in camera.model.name and camera.model.name != "FOV":
         return None

@@ -17,7 +17,7 @@ from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.images import image_size, is_file, read_array
 from mipmap_plugin.formats.json_file import numbers, pixels, positive, present, read_json, rotation
 from mipmap_plugin.scenes.base import Scene
-from mipmap_plugin.scenes.cameras_json import trained_size
+from mipmap_plugin.scenes.cameras_json import DEFORMABLE, trained_size
 from mipmap_plugin.scenes.transforms import viewmat_from_opengl
 
 # DyNeRF: px of the recorded width, to which focal lengths refer, and of the training size; and the number of frames of a video.
@@ -25,9 +25,6 @@ RECORDED, WIDTH, HEIGHT, FRAMES = 2704, 1352, 1014, 300
 
 # HyperNeRF: photographs are taken at half their size; without a list of test views, every fourth view is for training.
 HALF, EVERY = 2, 4
-
-# An option in the cfg_args of Deformable 3D Gaussians that no other project has which reads these captures.
-DEFORMABLE = "is_6dof"
 
 View = tuple[str, Literal["train", "test"]]  # its name and split
 

@@ -14,10 +14,11 @@ from torch import Tensor
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.formats.images import image_size
 from mipmap_plugin.models.base import Placed, SplatModel
 from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.scenes import Scene
-from mipmap_plugin.scenes.base import SPLIT
+from mipmap_plugin.scenes.base import SHAPE_TOLERANCE, SPLIT
 
 
 class Photographs:
@@ -34,6 +35,10 @@ class Photographs:
         if not self._originals:
             raise SettingsError(f"{scene.source}: there are no training images to adapt to; leave them out, or give the folder that has them")
         self.cameras = list(self._originals)
+        view, file = self.cameras[0], scene.images[self._originals[self.cameras[0]]]
+        if (size := image_size(file))[0] < (1 - SHAPE_TOLERANCE) * view.width:
+            small = f"{file} has {size[0]} x {size[1]} px, but the base was trained at {view.width} x {view.height} px"
+            raise SettingsError(f"{small}: made larger, it shows less than the base; give larger photographs, or leave them out")
 
     def note(self, views: Sequence[Camera]) -> str:
         """How many of the views have a photograph. Raises SettingsError if none has."""
@@ -89,7 +94,7 @@ def placed(model: SplatModel, scene: Scene) -> Scene:
     if not model.traits.placed:
         return scene
     scene = scene.original()
-    capture = Capture(scene.points, scene.smaller if scene.images else None, scene.applied_scale)
+    capture = Capture(scene.points, scene.smaller if scene.images else None, scene.applied_scale, scene.numbers)
     there = scene.with_cameras(cast(Placed, model).as_trained(scene.cameras, capture))
     if [camera.split for camera in there.cameras] == [camera.split for camera in scene.cameras]:
         return there

@@ -36,6 +36,7 @@ from mipmap_plugin.evaluation.tradeoff.truth import GroundTruth
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.progress import ticking
 from mipmap_plugin.recipes import most_steps
+from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.screen_filters import SCREEN_FILTERS
 from mipmap_plugin.wrap import Wrapped
 
@@ -79,10 +80,16 @@ class _Measurement:
                 yield from self._kept({"baseline": baseline.name, "backend": baseline.backend}, partial(self._of_baseline, baseline, count))
                 bar.update()
             for name, steps, backend in self._runs:
-                yield from self._kept({"recipe": name, "steps": steps, "backend": backend}, partial(self._of_run, name, steps, backend, bar))
+                run = {"recipe": name, "steps": steps, "backend": backend, "made": self._made(name)}
+                yield from self._kept(run, partial(self._of_run, name, steps, backend, bar))
             if plan.renderers:
-                yield from self._kept({"renderers": self._runs[:1]}, partial(self._of_renderers, bar))
+                made = [self._made(name) for name, *_ in self._runs[:1]]
+                yield from self._kept({"renderers": self._runs[:1], "made": made}, partial(self._of_renderers, bar))
                 bar.update(len(RENDERERS))
+
+    def _made(self, recipe: str) -> dict[str, Any]:
+        """The settings of a recipe; a registered one may have been edited since an interruption."""
+        return make_config(recipe, self._scale).model_dump()
 
     def _kept(self, key: dict[str, Any], measure: Callable[[], list[Point]]) -> list[Point]:
         """The points of a cell: measured now, or kept from before an interruption."""
