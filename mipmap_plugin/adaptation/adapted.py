@@ -94,6 +94,7 @@ class Adapted:
         facts = notebook.adapted_facts(self.model, self.report)
         return notebook.table("Adapted", facts, lambda camera: self.render(camera).image, self.views()[0])
 
+    @usual_modes()
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""
         path = path_of(path)

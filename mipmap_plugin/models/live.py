@@ -78,7 +78,8 @@ def adopt(model: Any) -> SplatModel:
     if callable(getattr(model, "gaussians", None)):
         if members := lacking(model):
             raise SettingsError(f"this {_name(model)} has gaussians() as a model has, but lacks {', '.join(members)}; see mipmap_plugin.models.base")
-        return _checked(model)
+        inference = any(tensor.is_inference() for tensor in {**model.parameters(), **model.shared_parameters()}.values())
+        return _checked(model.to(model.parameters()["means"].device) if inference else model)  # no gradient passes such tensors
     if isinstance(model, Gaussians):
         splats = replace(model, **_copied(model, {name: tensor for name, tensor in vars(model).items() if tensor is not None}))
         return without_invalid(VanillaModel.from_gaussians(splats).noted("made of Gaussians"))
