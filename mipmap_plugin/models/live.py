@@ -16,7 +16,7 @@ from mipmap_plugin.models import splatfacto
 from mipmap_plugin.models.anchors.companions import NEEDED
 from mipmap_plugin.models.anchors.networks import Weights
 from mipmap_plugin.models.anchors.scaffold import scaffold_in_memory
-from mipmap_plugin.models.base import CARRIED, OPACITY_ROUNDING, SplatModel, TrainedScale
+from mipmap_plugin.models.base import CARRIED, OPACITY_ROUNDING, SplatModel, TrainedScale, tensors_of
 from mipmap_plugin.models.contract import lacking
 from mipmap_plugin.models.gsplat import model as gsplat
 from mipmap_plugin.models.health import without_invalid
@@ -78,7 +78,7 @@ def adopt(model: Any) -> SplatModel:
     if callable(getattr(model, "gaussians", None)):
         if members := lacking(model):
             raise SettingsError(f"this {_name(model)} has gaussians() as a model has, but lacks {', '.join(members)}; see mipmap_plugin.models.base")
-        inference = any(tensor.is_inference() for tensor in {**model.parameters(), **model.shared_parameters()}.values())
+        inference = any(tensor.is_inference() for tensor in tensors_of(model).values())
         return _checked(model.to(model.parameters()["means"].device) if inference else model)  # no gradient passes such tensors
     if isinstance(model, Gaussians):
         _refuse_raw(model)
