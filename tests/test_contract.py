@@ -17,6 +17,7 @@ from mipmap_plugin.models import API_VERSION, CERTAIN, Family, Match, TrainedSca
 from mipmap_plugin.models.conformance import ModelSuite
 from mipmap_plugin.models.contract import lacking
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
+from mipmap_plugin.splatting.rotations import rotations
 
 BRIEF = dict(steps=1, extra_views=2, validation_views=2)
 
@@ -114,6 +115,22 @@ class Counting(Tinted):
         with torch.no_grad():
             self.tint.mul_(0.999)
         return super().gaussians(camera)
+
+
+class Ellipsoids(Theirs):
+    """Its splats are told by covariances."""
+
+    def gaussians(self, camera=None):
+        splats = super().gaussians(camera)
+        axes = rotations(splats.quats) * splats.scales[:, None, :]
+        return replace(splats, covariances=axes @ axes.mT)
+
+
+def test_splats_of_covariances_are_merged():
+    raw, views = tiny.model(300).parameters(), tiny.cameras(2)
+    merged, plain = (wrap_model(kind(raw), cameras=views).adapt(0.125, recipe="instant", most_splats=200).report for kind in (Ellipsoids, Theirs))
+    assert merged.gaussians_after == plain.gaussians_after == 200
+    assert merged.psnr_after() == pytest.approx(plain.psnr_after(), abs=0.5)
 
 
 class Leafless(Tinted):

@@ -31,6 +31,7 @@ from mipmap_plugin.models.base import (
 )
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.plugin_errors import is_third_party, naming, naming_any
+from mipmap_plugin.splatting.eigen import by_axes
 
 # What a model with a trait provides beside what every model does.
 PROMISED = {"same_for_all_views": Rebuilt, "placed": Placed, "thins": Thinned, "filtered": Filtered}
@@ -144,11 +145,11 @@ def row_opacities(model: SplatModel, views: Sequence[Camera]) -> Tensor:
 
 
 def rebuild(model: SplatModel, form: Callable[[Gaussians], Gaussians]) -> None:
-    """Have the model rebuilt. Raises PluginError if it does not hold the splats of `form` then, or NaN."""
+    """Have the model rebuilt, from splats without covariances. Raises PluginError if it does not hold the splats of `form` then, or NaN."""
     made: list[int] = []
 
     def counted(gaussians: Gaussians) -> Gaussians:
-        formed = form(gaussians)
+        formed = form(gaussians if gaussians.covariances is None else by_axes(gaussians))
         made.append(len(formed))
         return formed
 
