@@ -226,7 +226,7 @@ class Camera:
         """The same view after the whole scene, this camera included, was transformed by `similarity` [4, 4] (rotation, scale, translation)."""
         linear = similarity[:3, :3].to("cpu", torch.float64)
         rotation = linear / torch.linalg.det(linear).abs().pow(1 / 3)
-        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat = torch.eye(4, dtype=torch.float64, device="cpu")
         viewmat[:3, :3] = self.viewmat[:3, :3] @ rotation.T
         viewmat[:3, 3] = -viewmat[:3, :3] @ (linear @ self.center + similarity[:3, 3].to("cpu", torch.float64))
         return replace(self, viewmat=viewmat)
@@ -250,12 +250,12 @@ def _matrix(name: str, given: Any, shape: tuple[int, int]) -> Tensor:
 
 
 # A camera of one pixel, for what does not depend on it.
-ONE_PIXEL = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
+ONE_PIXEL = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4, device="cpu"))
 
 
 def viewmat_of(rotation: Tensor, center: Tensor) -> Tensor:
     """World to camera [4, 4] float64 from a camera-to-world rotation [3, 3] and the eye [3]."""
-    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat = torch.eye(4, dtype=torch.float64, device="cpu")
     viewmat[:3, :3] = rotation.T
     viewmat[:3, 3] = -rotation.T @ center
     return viewmat

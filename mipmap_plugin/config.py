@@ -23,15 +23,17 @@ class LearningRates(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    means: float = Field(0.0, ge=0, description="Target pixels at the median splat, so that steps on the screen are the same for scenes of any size.")
-    scales: float = Field(0.005, ge=0, description="Of the log scales.")
-    quats: float = Field(0.001, ge=0)
-    opacities: float = Field(0.05, ge=0, description="Of the logits.")
-    sh0: float = Field(0.0025, ge=0)
-    shN: float = Field(0.0025 / 20, ge=0)
-    offsets: float = Field(0.0, ge=0, description="Of the offsets of an anchor's splats, in units of the anchor's size.")
-    features: float = Field(0.0075, ge=0, description="Of an anchor's feature vector.")
-    networks: float = Field(0.0, ge=0, description="Of the networks that all anchors share; a deformation network never changes.")
+    means: float = Field(
+        default=0.0, ge=0, description="Target pixels at the median splat, so that steps on the screen are the same for scenes of any size."
+    )
+    scales: float = Field(default=0.005, ge=0, description="Of the log scales.")
+    quats: float = Field(default=0.001, ge=0)
+    opacities: float = Field(default=0.05, ge=0, description="Of the logits.")
+    sh0: float = Field(default=0.0025, ge=0)
+    shN: float = Field(default=0.0025 / 20, ge=0)
+    offsets: float = Field(default=0.0, ge=0, description="Of the offsets of an anchor's splats, in units of the anchor's size.")
+    features: float = Field(default=0.0075, ge=0, description="Of an anchor's feature vector.")
+    networks: float = Field(default=0.0, ge=0, description="Of the networks that all anchors share; a deformation network never changes.")
 
 
 class AdaptConfig(BaseModel):
@@ -39,61 +41,105 @@ class AdaptConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    recipe: str = Field("default", description="The name of the recipe that these settings started from.")
-    steps: int = Field(1000, ge=0, description="Maximum number of optimizer steps.")
-    most_steps: int | None = Field(None, ge=0, description="Maximum number of steps in a time budget that has room for more than `steps`.")
-    most_draws: float | None = Field(None, gt=0, description="Fewer steps, a quarter of them at least, if they would draw more splats in all views.")
-    time_budget_s: float | None = Field(None, gt=0, description="Stop after this many seconds.")
-    target_db: float | None = Field(None, description="Stop at the first check whose PSNR against the pseudo truth (not photographs) is this high.")
-    patience: int | None = Field(None, gt=0, description="Stop at the knee: after this many checks in a row that gained less than `min_gain_db`.")
-    min_gain_db: float = Field(0.05, ge=0, description="Minimum gain in dB between checks, for `patience`.")
-    check_every: int = Field(50, gt=0, description="Steps between two points of the curve.")
-    seed: int = Field(0, ge=0, le=MAX_SEED, description="Seed of everything random.")
+    recipe: str = Field(default="default", description="The name of the recipe that these settings started from.")
+    steps: int = Field(default=1000, ge=0, description="Maximum number of optimizer steps.")
+    most_steps: int | None = Field(default=None, ge=0, description="Maximum number of steps in a time budget that has room for more than `steps`.")
+    most_draws: float | None = Field(
+        default=None, gt=0, description="Fewer steps, a quarter of them at least, if they would draw more splats in all views."
+    )
+    time_budget_s: float | None = Field(default=None, gt=0, description="Stop after this many seconds.")
+    target_db: float | None = Field(
+        default=None, description="Stop at the first check whose PSNR against the pseudo truth (not photographs) is this high."
+    )
+    patience: int | None = Field(
+        default=None, gt=0, description="Stop at the knee: after this many checks in a row that gained less than `min_gain_db`."
+    )
+    min_gain_db: float = Field(default=0.05, ge=0, description="Minimum gain in dB between checks, for `patience`.")
+    check_every: int = Field(default=50, gt=0, description="Steps between two points of the curve.")
+    seed: int = Field(default=0, ge=0, le=MAX_SEED, description="Seed of everything random.")
 
-    band: tuple[Factor, Factor] = Field((1.0, 1.0), description="Zoom-out: the file is shown from the first to the second multiple of its scale.")
-    resize: ResizeFilter = Field("pil-bicubic", description="Filter that shrinks images, as that of a protocol; `fitting`: what fits the base.")
-    upsampler: str = Field("bicubic", description="What makes base images larger: a registered name, or the file of a network.")
-    compare_at: Literal["target", "base", "both"] = Field("target", description="Zoom-in: compare with the upsampled base, the base itself, or both.")
-    detail_weight: float = Field(0.1, ge=0, description="`both`: weight of the difference from the upsampled base; that from the base has weight 1.")
-    detail_structure: float = Field(0.0, ge=0, le=1, description="`both`: fraction of the former that is the difference of structure, 1 - SSIM.")
-    detail_contrast: float = Field(0.0, ge=0, description="`both`: weight in the former of the difference in the strength of local contrasts.")
-    upsampled_views: int = Field(50, gt=0, description="`both`: maximum number of views, each of which is upsampled.")
-    quantize_truth: bool = Field(False, description="Round the pseudo truth to 8 bits, as in PNG files.")
-    truth_oversampling: int | None = Field(None, gt=0, description="Render the base at most this many times finer than the target; None: full size.")
+    band: tuple[Factor, Factor] = Field(
+        default=(1.0, 1.0), description="Zoom-out: the file is shown from the first to the second multiple of its scale."
+    )
+    resize: ResizeFilter = Field(
+        default="pil-bicubic", description="Filter that shrinks images, as that of a protocol; `fitting`: what fits the base."
+    )
+    upsampler: str = Field(default="bicubic", description="What makes base images larger: a registered name, or the file of a network.")
+    compare_at: Literal["target", "base", "both"] = Field(
+        default="target", description="Zoom-in: compare with the upsampled base, the base itself, or both."
+    )
+    detail_weight: float = Field(
+        default=0.1, ge=0, description="`both`: weight of the difference from the upsampled base; that from the base has weight 1."
+    )
+    detail_structure: float = Field(
+        default=0.0, ge=0, le=1, description="`both`: fraction of the former that is the difference of structure, 1 - SSIM."
+    )
+    detail_contrast: float = Field(
+        default=0.0, ge=0, description="`both`: weight in the former of the difference in the strength of local contrasts."
+    )
+    upsampled_views: int = Field(default=50, gt=0, description="`both`: maximum number of views, each of which is upsampled.")
+    quantize_truth: bool = Field(default=False, description="Round the pseudo truth to 8 bits, as in PNG files.")
+    truth_oversampling: int | None = Field(
+        default=None, gt=0, description="Render the base at most this many times finer than the target; None: full size."
+    )
 
-    views: ViewPolicy = Field("jittered", description="Which views to adapt to; `jittered`: the train views and random views around them.")
+    views: ViewPolicy = Field(default="jittered", description="Which views to adapt to; `jittered`: the train views and random views around them.")
     moments: int | None = Field(
-        24, gt=0, description="Maximum number of moments of a moving scene that views are adapted at; None, and with photographs: each at its own."
+        default=24,
+        gt=0,
+        description="Maximum number of moments of a moving scene that views are adapted at; None, and with photographs: each at its own.",
     )
-    extra_views: int = Field(100, ge=0, description="Number of views that `jittered` adds, or that an orbit has.")
+    extra_views: int = Field(default=100, ge=0, description="Number of views that `jittered` adds, or that an orbit has.")
 
-    closed_form: bool = Field(True, description="Start from the closed form instead of from the base.")
-    crispness: float = Field(0.0, ge=0, le=1, description="Zoom-in: from 0 (highest PSNR) to 1 (splats as small as the base's, but more opaque).")
-    merge_to: float = Field(1.0, gt=0, le=1, description="Fraction of the splats to keep when similar splats that share pixels are merged.")
-    merging_costs: float = Field(
-        0.3, ge=0, description="Maximum loss of merging in dB on validation views before the first step; for another renderer at least 0.6, unless 0."
+    closed_form: bool = Field(default=True, description="Start from the closed form instead of from the base.")
+    crispness: float = Field(
+        default=0.0, ge=0, le=1, description="Zoom-in: from 0 (highest PSNR) to 1 (splats as small as the base's, but more opaque)."
     )
-    most_splats: int | None = Field(None, gt=0, description="Merge to at most this many splats, whatever it costs, in place of `merge_to`.")
+    merge_to: float = Field(default=1.0, gt=0, le=1, description="Fraction of the splats to keep when similar splats that share pixels are merged.")
+    merging_costs: float = Field(
+        default=0.3,
+        ge=0,
+        description="Maximum loss of merging in dB on validation views before the first step; for another renderer at least 0.6, unless 0.",
+    )
+    most_splats: int | None = Field(default=None, gt=0, description="Merge to at most this many splats, whatever it costs, in place of `merge_to`.")
     rates: LearningRates = LearningRates()
-    loss: Literal["psnr", "l2", "l1"] = Field("l2", description="Logarithm of the mean square error, mean square error, or mean absolute error.")
-    decay: float = Field(1.0, gt=0, le=1, description="Fraction of itself that every learning rate decays to, along half a cosine.")
-    betas: tuple[Momentum, Momentum] = Field((0.9, 0.999), description="Adam's decay rates of the moments.")
-    nesterov: bool = Field(False, description="Adam with Nesterov's momentum: each step counts the newest gradient once more.")
-    conversion_steps: int = Field(0, ge=0, description="Zoom-in for what draws otherwise than the training did: at most so many steps at x1 before.")
-    least_zoom_in: float = Field(1.0, ge=1, description="No steps are taken at a zoom-in below this for what draws as the training did.")
-    views_per_step: int = Field(1, gt=0, description="Views whose gradients are summed for one step.")
-    order: Literal["shuffled", "spread"] = Field("shuffled", description="Order of the views in each round; `spread`: neighbors look from all sides.")
-    warm_up: float = Field(0.0, ge=0, le=1, description="Fraction of the steps during which learning rates rise, as far as validation allows.")
-    gathering: float = Field(0.0, ge=0, le=1, description="Fraction of the run during which new views are introduced; each costs a render.")
-    validation_views: int = Field(16, ge=2, description="Maximum number of views for validation: half steer the run, half choose what it returns.")
-    returns: Literal["best", "last"] = Field("best", description="Return the best state on validation views, base and start included, or the last.")
-    prune_every: int = Field(100, gt=0, description="Steps between two prunings.")
-    min_opacity: float = Field(0.005, ge=0, lt=1, description="Splats of lower opacity are pruned.")
-    densify_gradient: float | None = Field(None, gt=0, description="Screen gradient (NDC units) above which splats are cloned or split; None: never.")
-    densify_keeps_image: bool = Field(False, description="Split splats in two with little change of the image, instead of the published cloning.")
-    densify_on_trial: bool = Field(False, description="Undo growth that leaves views farther from the base than at the start.")
-    most_growth: float | None = Field(None, ge=1, description="Maximum ratio of splats after densifying to splats before; None: unlimited.")
-    reset_opacity_at: int | None = Field(None, ge=0, description="Step before which all opacities are cut to 0.01, on a white background only.")
+    loss: Literal["psnr", "l2", "l1"] = Field(
+        default="l2", description="Logarithm of the mean square error, mean square error, or mean absolute error."
+    )
+    decay: float = Field(default=1.0, gt=0, le=1, description="Fraction of itself that every learning rate decays to, along half a cosine.")
+    betas: tuple[Momentum, Momentum] = Field(default=(0.9, 0.999), description="Adam's decay rates of the moments.")
+    nesterov: bool = Field(default=False, description="Adam with Nesterov's momentum: each step counts the newest gradient once more.")
+    conversion_steps: int = Field(
+        default=0, ge=0, description="Zoom-in for what draws otherwise than the training did: at most so many steps at x1 before."
+    )
+    least_zoom_in: float = Field(default=1.0, ge=1, description="No steps are taken at a zoom-in below this for what draws as the training did.")
+    views_per_step: int = Field(default=1, gt=0, description="Views whose gradients are summed for one step.")
+    order: Literal["shuffled", "spread"] = Field(
+        default="shuffled", description="Order of the views in each round; `spread`: neighbors look from all sides."
+    )
+    warm_up: float = Field(
+        default=0.0, ge=0, le=1, description="Fraction of the steps during which learning rates rise, as far as validation allows."
+    )
+    gathering: float = Field(default=0.0, ge=0, le=1, description="Fraction of the run during which new views are introduced; each costs a render.")
+    validation_views: int = Field(
+        default=16, ge=2, description="Maximum number of views for validation: half steer the run, half choose what it returns."
+    )
+    returns: Literal["best", "last"] = Field(
+        default="best", description="Return the best state on validation views, base and start included, or the last."
+    )
+    prune_every: int = Field(default=100, gt=0, description="Steps between two prunings.")
+    min_opacity: float = Field(default=0.005, ge=0, lt=1, description="Splats of lower opacity are pruned.")
+    densify_gradient: float | None = Field(
+        default=None, gt=0, description="Screen gradient (NDC units) above which splats are cloned or split; None: never."
+    )
+    densify_keeps_image: bool = Field(
+        default=False, description="Split splats in two with little change of the image, instead of the published cloning."
+    )
+    densify_on_trial: bool = Field(default=False, description="Undo growth that leaves views farther from the base than at the start.")
+    most_growth: float | None = Field(default=None, ge=1, description="Maximum ratio of splats after densifying to splats before; None: unlimited.")
+    reset_opacity_at: int | None = Field(
+        default=None, ge=0, description="Step before which all opacities are cut to 0.01, on a white background only."
+    )
 
     @field_validator("upsampler", mode="before")
     @classmethod

@@ -32,7 +32,7 @@ from mipmap_plugin.formats.atomic import named, refuse_output, refuse_unwritable
 from mipmap_plugin.formats.splat_transform import refuse_unread
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_image, check_kinds, check_names, check_scale, path_of
-from mipmap_plugin.models.base import Filtered, SplatModel, TrainedScale, checked_splats, why_no_viewer
+from mipmap_plugin.models.base import Filtered, SplatModel, TrainedScale, checked_splats, tensors_of, why_no_viewer
 from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
 from mipmap_plugin.models.outputs import parts_of
 from mipmap_plugin.models.places import REPORT, state_path
@@ -204,7 +204,7 @@ class FrozenBase:
         request = AdaptationRequest(base_images, targets, viewer, note, has_gradients, self.viewpoints, base_in_viewer, finer, inputs)
         family, theirs = f"family {model.family!r}", {f"backend {backend.name!r}": getattr(backend, "theirs", backend)}
         alone = threads.limited_for(backend, self.threads)
-        with alone, torch.enable_grad(), naming_any({family: model, **theirs}), unchanged(family, model.parameters()):
+        with alone, torch.enable_grad(), naming_any({family: model, **theirs}), unchanged(family, tensors_of(model)):
             stages = Stages(request, list(cameras), photographs, state, observe)
             adapted = stages.adapt(scale, config, first)
         adapted.report.seconds["loading"] = self.loading_s

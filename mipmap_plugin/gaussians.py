@@ -22,7 +22,8 @@ class Gaussians:
         scales: [N, 3] world units, standard deviations along the local axes.
         opacities: [N], 0..1.
         sh: [N, (degree + 1)**2, 3], coefficients of the colors' spherical harmonics, basis-major, as 3DGS has them; degree 0 to 4.
-        covariances: [N, 3, 3] world units², override quats and scales where a family needs it; None: they do not.
+        covariances: [N, 3, 3] world units², override quats and scales where a family needs it; None: they do not. Adaptation starts from quats and
+            scales nevertheless, which have to be nearly theirs.
     """
 
     means: Tensor

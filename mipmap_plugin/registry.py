@@ -59,8 +59,11 @@ class Registry:
         return load_target(name, target) if isinstance(target, str) else target
 
     def packages(self) -> dict[str, str]:
-        """The targets of installed packages by name, with the package: "package.module:Name of my-package 1.0"."""
-        return {point.name: f"{point.value}{_package(point)}" for point in entry_points(group=self.group)}
+        """The targets of installed packages by name, with the package: "package.module:Name of my-package 1.0", and with others of that name."""
+        found: dict[str, list[str]] = {}
+        for point in entry_points(group=self.group):
+            found.setdefault(point.name, []).append(f"{point.value}{_package(point)}")
+        return {name: "; not used, as the name is the same: ".join(dict.fromkeys(places)) for name, places in found.items()}
 
     def is_taken(self, name: str) -> bool:
         """Whether what an installed package has under a name is not taken, for it is registered here."""
@@ -76,11 +79,11 @@ def _package(point: EntryPoint) -> str:
 
 @lru_cache(maxsize=64)
 def _points(find: Callable[..., Iterable[EntryPoint]], group: str, _folders: tuple[tuple[str, float], ...]) -> Mapping[str, str]:
-    """The targets of a group by name, as `find` finds them in folders that were modified at these times.
+    """The targets of a group by name, as `find` finds them in folders that were modified at these times; of one name the first, as of modules.
 
     Finding reads a file of every package that is installed, and a command asks twenty times for what only an installation changes.
     """
-    return {point.name: point.value for point in find(group=group)}
+    return {point.name: point.value for point in reversed(list(find(group=group)))}
 
 
 def _modified(folder: str) -> float:

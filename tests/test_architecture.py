@@ -124,6 +124,12 @@ def test_imports_lead_downwards():
     assert offenders(lambda path: breaches(name_of(path), imports(path)), below) == {}
 
 
+def test_settings_name_their_defaults():
+    """Type checkers know no other (PEP 681): to them a default by place is a setting that has to be given."""
+    fields = [node for node in nodes(PACKAGE / "config.py") if isinstance(node, ast.Call) and ast.unparse(node.func) == "Field"]
+    assert fields and [ast.unparse(field) for field in fields if field.args] == []
+
+
 def test_a_breach_would_be_found():
     assert breaches("scenes/base.py", {"mipmap_plugin.models.base.SplatModel", "mipmap_plugin.camera.Camera"}) == ["models"]
     assert breaches("wrap.py", {"mipmap_plugin.evaluation.metrics.psnr", "mipmap_plugin.models.load_model"}) == ["evaluation"]

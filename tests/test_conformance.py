@@ -195,6 +195,16 @@ def test_a_backend_of_degree_0_is_run_and_its_faults_are_found():
     }  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("part", "value", "said"), [("speed", "fast", "speed: a number is needed, got 'fast'"), ("api_version", 0, "it is written for 0")]
+)
+def test_the_suite_says_what_a_backend_declares_wrong(part, value, said):
+    declared = type("Odd", (ReferenceBackend,), {part: value})()
+    with pytest.raises(AssertionError, match=said):
+        type("Suite", (BackendSuite,), {"backend": declared})().test_declares_itself()
+    type("Suite", (BackendSuite,), {"backend": type("Odd", (ReferenceBackend,), {"speed": 0.5})()})().test_declares_itself()
+
+
 class OfDoubles(OfDegree0):
     capabilities = replace(OfDegree0.capabilities, dtypes=frozenset({torch.float64}))
 

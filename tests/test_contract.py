@@ -17,6 +17,7 @@ from mipmap_plugin.models import API_VERSION, CERTAIN, Family, Match, TrainedSca
 from mipmap_plugin.models.conformance import ModelSuite
 from mipmap_plugin.models.contract import lacking
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
+from mipmap_plugin.splatting.rotations import rotations
 
 BRIEF = dict(steps=1, extra_views=2, validation_views=2)
 
@@ -46,6 +47,12 @@ def parameters(**changes):
         (dict(parameters=parameters(features=torch.zeros(7, 2))), "lacks parameters of one length: it has 60 means, .*, 7 features; see"),
         (dict(parameters=parameters(carried=torch.tensor(1.0))), "lacks parameters of one length: it has 60 means, .*, single carried; see"),
         (dict(parameters=parameters(features=[1], offsets=None)), "lacks tensors as the parameters features, offsets; see"),
+        (dict(shared_parameters=lambda self: None), r"lacks shared_parameters\(\) that returns a dictionary; see"),
+        (dict(shared_parameters=lambda self: {"w": [1]}), "lacks tensors as the parameters w; see"),
+        (
+            dict(traits=property(lambda self: Traits(plain=True), lambda self, traits: None), parameters=parameters(offsets=torch.zeros(60, 3))),
+            "lacks the parameters means, .* shN, which its trait `plain` promises; see",
+        ),
     ],
 )
 def test_what_does_not_fit_a_model_is_told_when_it_is_wrapped(members, said):
@@ -81,6 +88,64 @@ def without_a_color(self, camera=None):
 def with_a_root_of_0(self, camera=None):
     splats = VanillaModel.gaussians(self, camera)
     return replace(splats, means=splats.means + (splats.means - splats.means.detach()).norm(dim=1, keepdim=True).sqrt())
+
+
+class Tinted(Theirs):
+    """Its colors have a factor that all splats share."""
+
+    def __init__(self, *args):
+        super().__init__(*args)
+        self.tint = torch.ones(3)
+
+    def shared_parameters(self):
+        return {"tint": self.tint}
+
+    def copy(self):
+        copied = super().copy()
+        copied.tint = self.tint.clone().requires_grad_()
+        return copied
+
+    def gaussians(self, camera=None):
+        splats = super().gaussians(camera)
+        return replace(splats, sh=splats.sh * self.tint)
+
+
+class Counting(Tinted):
+    def gaussians(self, camera=None):
+        with torch.no_grad():
+            self.tint.mul_(0.999)
+        return super().gaussians(camera)
+
+
+class Ellipsoids(Theirs):
+    """Its splats are told by covariances."""
+
+    def gaussians(self, camera=None):
+        splats = super().gaussians(camera)
+        axes = rotations(splats.quats) * splats.scales[:, None, :]
+        return replace(splats, covariances=axes @ axes.mT)
+
+
+def test_splats_of_covariances_are_merged():
+    raw, views = tiny.model(300).parameters(), tiny.cameras(2)
+    merged, plain = (wrap_model(kind(raw), cameras=views).adapt(0.125, recipe="instant", most_splats=200).report for kind in (Ellipsoids, Theirs))
+    assert merged.gaussians_after == plain.gaussians_after == 200
+    assert merged.psnr_after() == pytest.approx(plain.psnr_after(), abs=0.5)
+
+
+class Leafless(Tinted):
+    def shared_parameters(self):
+        return {"tint": self.tint * 1}
+
+
+def test_parameters_that_all_rows_share_are_looked_at_too():
+    raw, views = tiny.model().parameters(), tiny.cameras(2)
+    tinted = Tinted(raw)
+    assert not torch.equal(wrap_model(tinted, cameras=views).adapt(0.25, **BRIEF, rates={"networks": 0.1}).model.tint, tinted.tint)
+    with pytest.raises(PluginError, match=r"family 'theirs' changed its input in place \(tint\)"):
+        wrap_model(Counting(raw), cameras=views).render(views[0])
+    with pytest.raises(PluginError, match=r"copy\(\) has to return parameters that are leaves and require gradients; tint cannot be optimized"):
+        wrap_model(Leafless(raw), cameras=views).adapt(0.25, **BRIEF)
 
 
 @pytest.mark.parametrize(

@@ -124,6 +124,7 @@ class Anchors:
         ({name: tensor for name, tensor in splats().items() if name != "shN"}, r"shN is empty, \[N, 0, 3\]\), and this one lacks shN$"),
         ({**splats(), "features": torch.zeros(30, 32)}, r"and this one has features besides$"),
         (wrap_model(splats()), "a Wrapped is not a known kind of model; give its attribute `model`$"),
+        (torch.nn.DataParallel(torch.nn.Linear(1, 1)), "a DataParallel is not a known kind of model; give its attribute `module`$"),
         (7, "an int is not a known kind of model; give a path"),
     ],
 )
@@ -179,6 +180,14 @@ def test_gaussians_are_taken_as_splats_of_3dgs():
         adopt(replace(given, covariances=torch.eye(3).expand(len(given), 3, 3)))
     with pytest.raises(SettingsError, match="this Gaussians has no splats yet"):
         adopt(given[:0])
+
+
+def test_gaussians_of_raw_parameters_are_refused():
+    given = adopt(splats()).gaussians().detach()
+    with pytest.raises(SettingsError, match=r"these Gaussians have negative scales, but scales are lengths, .* activated by scales\.exp\(\)"):
+        wrap_model(replace(given, scales=given.scales.log()))
+    with pytest.raises(SettingsError, match=r"these Gaussians have opacities from -\d.* to \d.*, but"):
+        wrap_model(replace(given, opacities=given.opacities.logit()))
 
 
 def test_scales_of_no_shape_are_refused():

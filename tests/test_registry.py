@@ -181,6 +181,13 @@ def test_an_installed_package_cannot_shadow_a_built_in(install):
     assert type(get_backend("reference")) is ReferenceBackend
 
 
+def test_of_two_packages_with_one_name_the_first_is_used_and_the_other_is_told(monkeypatch):
+    points = [EntryPoint("ours", f"{__name__}:{kind}", "mipmap_plugin.backends") for kind in ("Fast", "Fussy")]
+    monkeypatch.setattr(registry, "entry_points", lambda group: points)
+    assert get_backend("ours").name == "fast"
+    assert BACKENDS.packages() == {"ours": f"{__name__}:Fast; not used, as the name is the same: {__name__}:Fussy"}
+
+
 def test_targets_are_imported_only_when_used(tmp_path, monkeypatch):
     (tmp_path / "lazy_plugin.py").write_text("thing = 'made'")
     monkeypatch.syspath_prepend(tmp_path)

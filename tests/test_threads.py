@@ -1,6 +1,8 @@
 """Threads: results keep their order and their bits, torch gets its own back, and what takes long is announced."""
 
 import io
+import os
+import signal
 import sys
 import threading
 import time
@@ -206,3 +208,29 @@ def test_a_wrapped_model_renders_with_its_own_threads():
     model.__class__ = Watched
     wrap_model(model, cameras=tiny.cameras(1), backend="cpu", threads=before + 1).render(tiny.cameras(1)[0])
     assert seen[-1] == before + 1 and torch.get_num_threads() == before
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_forked_worker_that_asks_for_threads_does_not_wait_for_those_of_its_parent():
+    before, large = torch.get_num_threads(), torch.ones(1 << 18)
+    torch.set_num_threads(2)
+    try:
+        large.exp()  # in two threads
+        worker = os.fork()
+        if not worker:
+            try:
+                torch.set_num_threads(1)  # as DataLoader does
+                with threads.limited(2, shared=False):
+                    large.exp()
+                os._exit(0)
+            finally:
+                os._exit(1)
+    finally:
+        torch.set_num_threads(before)
+    try:
+        wait_until(lambda: os.waitpid(worker, os.WNOHANG) == (worker, 0), seconds=10)
+    except BaseException:
+        os.kill(worker, signal.SIGKILL)
+        os.waitpid(worker, 0)
+        raise

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import runpy
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 
 import pytest
 import tiny
 import torch
+from torch_checkpoints import gsplat_folder
 
+import mipmap_plugin.camera
+import mipmap_plugin.models.surfels
+from mipmap_plugin import load_model, load_scene
+from mipmap_plugin.models.surfels import FLAT
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.process.torch_modes import usual_modes
 from mipmap_plugin.wrap import wrap_model
 
@@ -49,6 +57,41 @@ def test_an_adaptation_is_the_same_in_any_mode(mode: str) -> None:
         other = adapted()
     assert all(torch.equal(tensor.detach(), other[name].detach()) for name, tensor in plain.items())
     assert torch.get_default_dtype() == torch.float32 and not torch.is_autocast_enabled("cpu")
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_files_are_read_and_written_the_same_in_any_mode(mode: str, tmp_path: Path) -> None:
+    base = tiny.folder(tmp_path / "base", CAMERAS)
+    checkpoint = gsplat_folder(tmp_path / "gsplat", BALL)
+
+    def files(name: str) -> list[bytes]:
+        made = wrap_model(load_model(base), cameras=load_scene(base)).adapt(0.5, recipe="instant")
+        own = load_model(checkpoint)
+        wrap_model(own, cameras=CAMERAS).render(CAMERAS[0])  # which looks at the versions of its tensors
+        saved = [made.save(tmp_path / f"{name}.ply"), load_model(base).save(tmp_path / f"{name}_base.ply", provenance={})]
+        return [file.read_bytes() for file in saved]
+
+    plain = files("plain")
+    with MODES[mode]():
+        other = files("other")
+    assert other == plain
+
+
+def test_a_model_of_inference_tensors_is_taken() -> None:
+    with torch.inference_mode():
+        model = VanillaModel({name: tensor.clone() for name, tensor in BALL.items()})
+    base, plain = wrap_model(model, cameras=CAMERAS), wrap_model(tiny.model(), cameras=CAMERAS)
+    assert torch.equal(base.render(CAMERAS[0]).image, plain.render(CAMERAS[0]).image)
+    assert base.adapt(0.5, steps=1, extra_views=2).report.validation
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_modules_are_imported_the_same_in_any_mode(mode: str) -> None:
+    with MODES[mode]():
+        camera, surfels = (runpy.run_path(module.__file__) for module in (mipmap_plugin.camera, mipmap_plugin.models.surfels))
+        moved = CAMERAS[0].moved(torch.eye(4, device="cpu"))
+    assert torch.equal(moved.viewmat, CAMERAS[0].moved(torch.eye(4)).viewmat)
+    assert torch.equal(camera["ONE_PIXEL"].viewmat, torch.eye(4, dtype=torch.float64)) and surfels["FLAT"] == FLAT
 
 
 def test_a_thread_that_ends_leaves_the_default_dtype_to_those_that_go_on() -> None:

@@ -27,7 +27,7 @@ from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_image, path_of
 from mipmap_plugin.models import contract, load_model
-from mipmap_plugin.models.base import SplatModel, checked_splats, effects_of
+from mipmap_plugin.models.base import SplatModel, checked_splats, effects_of, tensors_of
 from mipmap_plugin.models.exposure import exposed
 from mipmap_plugin.models.mip import for_loader_of
 from mipmap_plugin.models.outputs import drawn_otherwise, parts_of, without_place
@@ -94,6 +94,7 @@ class Adapted:
         facts = notebook.adapted_facts(self.model, self.report)
         return notebook.table("Adapted", facts, lambda camera: self.render(camera).image, self.views()[0])
 
+    @usual_modes()
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""
         path = path_of(path)
@@ -169,7 +170,7 @@ def render_model(
     """
     matrix = model.traits.exposures.of(camera) if effects.exposure else None
     family = f"family {model.family!r}"
-    with naming_any({family: model}), unchanged(family, model.parameters()):
+    with naming_any({family: model}), unchanged(family, tensors_of(model)):
         gaussians = checked_splats(model, camera)
     gaussians = gaussians if form is None else form(gaussians)
     rendered = supersample.render(backend, gaussians, camera, effects, clamped=clamped)

@@ -60,13 +60,15 @@ def load_model(path: str | Path, *, iteration: int | None = None) -> SplatModel:
         with told_of_archives():
             return load_model(folder, iteration=iteration)
     from mipmap_plugin.models.contract import lacking
+    from mipmap_plugin.process.torch_modes import usual_modes
 
     family = find_family(checkpoint.family)
     if family.load is None:
         raise CheckpointError(f"{checkpoint.path}: {not_loaded(checkpoint.family)}")
     load = load_target(family.name, family.load) if isinstance(family.load, str) else family.load
     try:
-        model: SplatModel = load(path, iteration=iteration)
+        with usual_modes():
+            model: SplatModel = load(path, iteration=iteration)
     except (MipmapPluginError, MemoryError):
         raise
     except (Exception, SystemExit) as error:  # third-party code may fail in any way

@@ -166,7 +166,7 @@ class Rebuilt(SplatModel, Protocol):
     """
 
     def rebuild(self, form: Callable[[Gaussians], Gaussians]) -> None:
-        """Replace the splats by those that `form` returns for them. Only called on a copy."""
+        """Replace the splats by those that `form` returns for them, which have no covariances if there are fewer. Only called on a copy."""
 
 
 class Thinned(SplatModel, Protocol):
@@ -229,10 +229,15 @@ def count_of(model: SplatModel, view: Camera) -> int:
     return len(model.parameters()["means"]) if model.traits.rows == SPLATS else len(model.gaussians(view))
 
 
+def tensors_of(model: SplatModel) -> dict[str, Tensor]:
+    """All parameters by name, those without rows too."""
+    return {**model.parameters(), **model.shared_parameters()}
+
+
 def digest_of_parameters(model: SplatModel) -> str:
     """The sha256 of the parameters of a model, hexadecimal: for one that was made in memory, or changed there."""
     digest = sha256()
-    for tensor in {**model.parameters(), **model.shared_parameters()}.values():
+    for tensor in tensors_of(model).values():
         digest.update(tensor.detach().cpu().numpy().tobytes())
     return digest.hexdigest()
 

@@ -65,7 +65,7 @@ def to_columns(parameters: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
     rest = tuple(f"f_rest_{i}" for i in range(3 * bands))
     blocks = {
         POSITION: raw["means"],
-        NORMAL: torch.zeros(1, 3).expand(count, 3),
+        NORMAL: torch.zeros(1, 3, dtype=torch.float32, device="cpu").expand(count, 3),
         DC: raw["sh0"][:, 0],
         ("opacity",): raw["opacities"][:, None],
         SCALE: raw["scales"],

@@ -27,12 +27,17 @@ from mipmap_plugin.models.base import (
     TrainedScale,
     Traits,
     checked_splats,
+    tensors_of,
 )
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.plugin_errors import is_third_party, naming, naming_any
+from mipmap_plugin.splatting.eigen import by_axes
 
 # What a model with a trait provides beside what every model does.
 PROMISED = {"same_for_all_views": Rebuilt, "placed": Placed, "thins": Thinned, "filtered": Filtered}
+
+# The parameters of a model with the trait `plain`.
+PLAIN = ("means", "scales", "quats", "opacities", "sh0", "shN")
 
 # The types of a model's attributes.
 TYPES: dict[str, tuple[type, ...]] = {
@@ -78,11 +83,14 @@ def _wrong_parameters(model: SplatModel) -> list[str]:
     """What `lacking` says of parameters: their names, and that each has one row for each splat or anchor."""
     with naming_any({f"family {model.family!r}": model}):
         parameters: Any = model.parameters()
-    if not isinstance(parameters, dict):
-        return ["parameters() that returns a dictionary"]
+        shared: Any = model.shared_parameters()
+    returned = {"parameters": parameters, "shared_parameters": shared}
+    if no_dictionary := [f"{name}() that returns a dictionary" for name, got in returned.items() if not isinstance(got, dict)]:
+        return no_dictionary
     wrong = ["the parameter 'means'"] * ("means" not in parameters)
     wrong += [f"a name of PARAMETERS for {name!r}" for name in parameters if name not in PARAMETERS]
-    if others := [name for name, tensor in parameters.items() if not isinstance(tensor, Tensor)]:
+    wrong += [f"the parameters {', '.join(PLAIN)}, which its trait `plain` promises"] * (model.traits.plain and {*parameters} != {*PLAIN})
+    if others := [name for name, tensor in {**parameters, **shared}.items() if not isinstance(tensor, Tensor)]:
         wrong.append(f"tensors as the parameters {', '.join(map(str, others))}")
     rows = {name: len(tensor) if tensor.ndim else "single" for name, tensor in parameters.items()} if not wrong else {}
     if len({*rows.values()}) > 1:
@@ -99,11 +107,12 @@ def refuse_broken(model: SplatModel, camera: Camera, *, steps: bool) -> None:
         copied = model.copy()
         if missing := lacking(copied):
             raise PluginError(f"{family}: copy() returned {type_of(copied)}, which lacks {', '.join(missing)}")
-        own, theirs = ({**each.parameters(), **each.shared_parameters()} for each in (model, copied))
+        own, theirs = tensors_of(model), tensors_of(copied)
     places = {tensor.untyped_storage().data_ptr() for tensor in own.values() if tensor.numel()}
     if shared := [name for name, tensor in theirs.items() if tensor.untyped_storage().data_ptr() in places]:
         raise PluginError(f"{family}: copy() shares {', '.join(shared)} with the model itself, which adaptation would change; clone the tensors")
     fixed = [name for name, tensor in copied.parameters().items() if name != CARRIED and not (tensor.is_leaf and tensor.requires_grad)]
+    fixed += [name for name, tensor in copied.shared_parameters().items() if not tensor.is_leaf]
     if fixed:
         raise PluginError(f"{family}: copy() has to return parameters that are leaves and require gradients; {', '.join(fixed)} cannot be optimized")
     if steps:
@@ -136,11 +145,11 @@ def row_opacities(model: SplatModel, views: Sequence[Camera]) -> Tensor:
 
 
 def rebuild(model: SplatModel, form: Callable[[Gaussians], Gaussians]) -> None:
-    """Have the model rebuilt. Raises PluginError if it does not hold the splats of `form` then, or NaN."""
+    """Have the model rebuilt, from splats without covariances. Raises PluginError if it does not hold the splats of `form` then, or NaN."""
     made: list[int] = []
 
     def counted(gaussians: Gaussians) -> Gaussians:
-        formed = form(gaussians)
+        formed = form(gaussians if gaussians.covariances is None else by_axes(gaussians))
         made.append(len(formed))
         return formed
 

@@ -16,7 +16,7 @@ from mipmap_plugin.models import splatfacto
 from mipmap_plugin.models.anchors.companions import NEEDED
 from mipmap_plugin.models.anchors.networks import Weights
 from mipmap_plugin.models.anchors.scaffold import scaffold_in_memory
-from mipmap_plugin.models.base import CARRIED, SplatModel, TrainedScale
+from mipmap_plugin.models.base import CARRIED, OPACITY_ROUNDING, SplatModel, TrainedScale, tensors_of
 from mipmap_plugin.models.contract import lacking
 from mipmap_plugin.models.gsplat import model as gsplat
 from mipmap_plugin.models.health import without_invalid
@@ -78,8 +78,10 @@ def adopt(model: Any) -> SplatModel:
     if callable(getattr(model, "gaussians", None)):
         if members := lacking(model):
             raise SettingsError(f"this {_name(model)} has gaussians() as a model has, but lacks {', '.join(members)}; see mipmap_plugin.models.base")
-        return _checked(model)
+        inference = any(tensor.is_inference() for tensor in tensors_of(model).values())
+        return _checked(model.to(model.parameters()["means"].device) if inference else model)  # no gradient passes such tensors
     if isinstance(model, Gaussians):
+        _refuse_raw(model)
         splats = replace(model, **_copied(model, {name: tensor for name, tensor in vars(model).items() if tensor is not None}))
         return without_invalid(VanillaModel.from_gaussians(splats).noted("made of Gaussians"))
     parts = [what for name, what in MORE.items() if hasattr(model, name)]
@@ -108,6 +110,16 @@ def adopt(model: Any) -> SplatModel:
     raise SettingsError(f"{type_of(model)}{content} is not a known kind of model; {_advice(model, tensors)}")
 
 
+def _refuse_raw(gaussians: Gaussians) -> None:
+    """Raise SettingsError for Gaussians of raw parameters, which as activated ones are mostly points of no opacity."""
+    low, high = (float(end) for end in gaussians.opacities.detach().aminmax()) if len(gaussians) else (0.0, 1.0)
+    outside = [f"opacities from {low:.3g} to {high:.3g}"] * (low < -OPACITY_ROUNDING or high > 1 + OPACITY_ROUNDING)
+    negative = ["negative scales"] * bool((gaussians.scales.detach() < 0).any())
+    if wrong := [*negative, *outside]:
+        raw = "raw parameters are activated by scales.exp() and opacities.sigmoid(), or given as a dictionary, as gsplat has them"
+        raise SettingsError(f"these Gaussians have {' and '.join(wrong)}, but scales are lengths, and opacities 0..1; {raw}")
+
+
 def _of_nerfstudio(model: Any) -> Any:
     """The model within nerfstudio's pipeline or trainer; anything else as it is."""
     within = getattr(getattr(model, "pipeline", model), "model", None)
@@ -116,6 +128,8 @@ def _of_nerfstudio(model: Any) -> Any:
 
 def _advice(model: Any, tensors: Mapping[str, Any]) -> str:
     """What to give instead of an object that is not known."""
+    if isinstance(model, torch.nn.Module) and isinstance(getattr(model, "module", None), torch.nn.Module):  # DistributedDataParallel, for one
+        return "give its attribute `module`"
     if callable(getattr(getattr(model, "model", None), "gaussians", None)):  # what is wrapped, or adapted
         return "give its attribute `model`"
     if "means" in tensors:

@@ -26,7 +26,7 @@ from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting.rotations import quaternion_product
 
 # Stands for the log of a third scale of 0; files do not contain it.
-FLAT = float(torch.tensor(MIN_SCALE).log())
+FLAT = float(torch.tensor(MIN_SCALE, dtype=torch.float32, device="cpu").log())
 
 NOTE = "its splats are flat (2DGS): only the reference backend draws them so, and only viewers of 2DGS show the adapted file right"
 

@@ -33,6 +33,20 @@ _shared: ContextVar[int | None] = ContextVar("_shared", default=None)
 _side_by_side: ContextVar[int] = ContextVar("_side_by_side", default=1)
 
 
+# Whether this process was forked from one with this module, as the workers of a DataLoader are. The threads of OpenMP are not forked with it: torch
+# would wait forever for those that it had, unless it has one, as DataLoader gives it.
+_forked = False
+
+
+def _note_fork() -> None:
+    global _forked
+    _forked = True
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
+    os.register_at_fork(after_in_child=_note_fork)
+
+
 def for_kernels() -> int:
     """The number of threads for one image."""
     return _shared.get() or torch.get_num_threads()
@@ -91,7 +105,7 @@ def lent_to_torch() -> Iterator[None]:
 @contextmanager
 def _torch_threads(count: int) -> Iterator[None]:
     before = torch.get_num_threads()
-    torch.set_num_threads(count)
+    torch.set_num_threads(min(count, before) if _forked else count)
     try:
         yield
     finally:

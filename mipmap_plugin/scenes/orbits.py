@@ -142,7 +142,7 @@ def sharp_size(gaussians: Gaussians) -> float:
         return math.inf
     away = (gaussians.means[seen] - gaussians.means[seen].median(dim=0).values).norm(dim=1)
     inner = away <= _quantile(away, INNER)
-    return float(sizes(gaussians)[seen][inner].median())
+    return float(sizes(gaussians.detach())[seen][inner].median())
 
 
 def sizes(gaussians: Gaussians) -> Tensor:

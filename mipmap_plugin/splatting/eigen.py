@@ -5,8 +5,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
+
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.rotations import quaternions
 
 # Jacobi's method converges quadratically: four sweeps take any matrix to double precision. One to spare.
 SWEEPS = 5
@@ -44,3 +49,13 @@ def _tangent(off: Tensor, gap: Tensor) -> Tensor:
     # 2·off / (gap ± sqrt(gap² + 4·off²)), with the sign for which both terms agree.
     below = gap.abs() + torch.hypot(gap, 2 * off)
     return torch.where(below > 0, 2 * off * torch.where(gap < 0, -1.0, 1.0) / torch.where(below > 0, below, 1.0), 0.0)
+
+
+def by_axes(gaussians: Gaussians) -> Gaussians:
+    """The same splats, their covariances as quaternions and scales. No gradient."""
+    if gaussians.covariances is None:
+        return gaussians
+    variances, directions = eigh3(gaussians.covariances.detach().double())
+    directions = directions * torch.linalg.det(directions).sign()[:, None, None]  # rotations, not reflections
+    quats, scales = quaternions(directions).to(gaussians.quats), variances.clamp_min(0).sqrt().to(gaussians.scales)
+    return replace(gaussians, quats=quats, scales=scales, covariances=None)

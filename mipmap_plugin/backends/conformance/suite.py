@@ -31,8 +31,9 @@ class BackendSuite:
     device: str = "cpu"
 
     def test_declares_itself(self) -> None:
-        assert self.backend.name and isinstance(self.backend.speed, int)
-        assert self.backend.api_version == API_VERSION
+        assert self.backend.name, "name: it has none"
+        assert isinstance(self.backend.speed, (int, float)), f"speed: a number is needed, got {self.backend.speed!r}"
+        assert self.backend.api_version == API_VERSION, f"api_version: it is written for {self.backend.api_version}, and this is {API_VERSION}"
 
     def test_can_be_checked(self) -> None:
         """Otherwise all is skipped, which looks like a success."""
