@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -39,6 +40,7 @@ sys.exit(code)
 @pytest.fixture(autouse=True)
 def _usual_signals():
     before = {number: signal.getsignal(number) for number in (*signals.SIGNALS, signal.SIGINT)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     for number in signals.SIGNALS:
         signal.signal(number, signal.SIG_DFL)  # also where these tests are run by nohup
     yield
@@ -84,6 +86,38 @@ def test_a_second_signal_counts_when_the_first_is_long_ago(monkeypatch):
         for _ in range(3):
             signal.raise_signal(signal.SIGTERM)
     assert len(heard) == 2
+
+
+def test_ctrl_c_twice_in_a_second_does_not_break_off_what_the_first_one_removes(monkeypatch):
+    now = iter([100.0, 100.0 + signals.TWICE_S / 2, 101.0 + signals.TWICE_S])
+    monkeypatch.setattr(signals.time, "monotonic", lambda: next(now))
+    removed = []
+    with pytest.raises(KeyboardInterrupt), ends_as_by_ctrl_c():
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            signal.raise_signal(signal.SIGINT)
+            removed.append(True)
+            signal.raise_signal(signal.SIGINT)
+    assert removed and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_is_heard_where_the_first_was_lost():
+    with pytest.raises(KeyboardInterrupt), ends_as_by_ctrl_c():
+        with contextlib.suppress(KeyboardInterrupt):  # as Python does where it imports or finalizes
+            signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("it went on")
+
+
+@pytest.mark.parametrize(("when", "code", "err"), [("import tyro", 130, "mipmap-plugin: interrupted\n"), ("atexit", 0, "")])
+def test_ctrl_c_before_and_after_a_command_is_no_traceback(when, code, err):
+    press = "lambda *_: signal.raise_signal(signal.SIGINT)"
+    lines = {"import tyro": f"sys.meta_path.insert(0, types.SimpleNamespace(find_spec={press}))", "atexit": f"atexit.register({press})"}
+    script = f"import atexit, signal, sys, types; sys.argv[1:] = ['--version']; import mipmap_plugin.__main__ as ours\n{lines[when]}\n"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = subprocess.run([sys.executable, "-c", script + "sys.exit(ours.run())"], env=environment, capture_output=True, text=True)
+    assert (abs(ended.returncode), ended.stderr) == (code, err)
 
 
 def test_it_ends_also_where_ctrl_c_is_ignored():
