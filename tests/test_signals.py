@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import zipfile
 
 import pressing
@@ -16,7 +17,7 @@ import tiny
 from mipmap_plugin.cli import main
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job
-from mipmap_plugin.jobs.worker import Worker, do
+from mipmap_plugin.jobs.worker import Worker, WorkerDied, do
 from mipmap_plugin.process import signals
 from mipmap_plugin.process.signals import ends_as_by_ctrl_c
 
@@ -139,6 +140,20 @@ def test_nothing_is_changed_afterwards():
         pass
     assert [signal.getsignal(number) for number in signals.SIGNALS] == [signal.SIG_DFL] * len(signals.SIGNALS)
     assert told.code == signals.INTERRUPTED
+
+
+@pytest.mark.parametrize("seconds", [0.05, 0.1, 0.2, 0.3])
+def test_a_worker_that_is_stopped_while_it_starts_says_nothing(tmp_path, capfd, seconds):
+    worker = Worker(1)
+    try:
+        worker.begin(Job(Base(tmp_path / "base"), tmp_path / "out.ply", 0.5))
+        time.sleep(seconds)
+        worker.stop()
+        with pytest.raises(WorkerDied):
+            worker.outcome()
+    finally:
+        worker.close()
+    assert capfd.readouterr().err == ""
 
 
 def test_a_job_whose_worker_is_told_to_end_is_done_again(tmp_path, monkeypatch):
