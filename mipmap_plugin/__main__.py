@@ -1,7 +1,21 @@
-"""`python -m mipmap_plugin`: the command, where it is not on the path."""
+"""The process of a command: what `mipmap-plugin` and `python -m mipmap_plugin` run."""
 
+import signal
 import sys
 
-from mipmap_plugin.cli import main
 
-sys.exit(main())
+def run() -> int:
+    """Run the command of this process, and return the exit code."""
+    try:
+        from mipmap_plugin.cli import main  # which takes a moment, in which Ctrl-C may be pressed
+    except KeyboardInterrupt:
+        sys.stderr.write("mipmap-plugin: interrupted\n")
+        return 130
+    try:
+        return main()
+    finally:  # Ctrl-C would only break off what removes temporary files, and Python would tell of that
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+if __name__ == "__main__":
+    sys.exit(run())

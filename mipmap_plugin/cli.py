@@ -70,27 +70,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: Sequence[str]) -> int:
     """Run a command; return the exit code."""
-    try:
-        with _our_warnings_only(), ends_as_by_ctrl_c() as ending:
-            if words and words[0] in COMMANDS:
-                refuse_repeated(COMMANDS[words[0]], words)
-            app.cli(prog="mipmap-plugin", description=DESCRIPTION, args=words)
-    except BrokenPipeError:  # as of `| head`, whose reader wants no more
-        return 141
-    except MipmapPluginError as error:
-        voice.complain(f"mipmap-plugin: {_told(error)}")
-        return 2
-    except OSError as error:
-        voice.complain(f"mipmap-plugin: {_told(of_a_file(error))}")
-        return 2
-    except (MemoryError, RuntimeError) as error:
-        if not is_out_of_memory(error):
-            raise
-        voice.complain("mipmap-plugin: out of memory; use a smaller scale, fewer views or smaller cameras")
-        return 2
-    except KeyboardInterrupt as interrupt:
-        voice.complain(f"\nmipmap-plugin: {str(interrupt) or 'interrupted'}")
-        return ending.code
+    with ends_as_by_ctrl_c() as ending:
+        try:
+            with _our_warnings_only():
+                if words and words[0] in COMMANDS:
+                    refuse_repeated(COMMANDS[words[0]], words)
+                app.cli(prog="mipmap-plugin", description=DESCRIPTION, args=words)
+        except KeyboardInterrupt as interrupt:
+            voice.complain(f"\nmipmap-plugin: {str(interrupt) or 'interrupted'}")
+            return ending.code
+        except BrokenPipeError:  # as of `| head`, whose reader wants no more
+            return 141
+        except MipmapPluginError as error:
+            voice.complain(f"mipmap-plugin: {_told(error)}")
+            return 2
+        except OSError as error:
+            voice.complain(f"mipmap-plugin: {_told(of_a_file(error))}")
+            return 2
+        except (MemoryError, RuntimeError) as error:
+            if not is_out_of_memory(error):
+                raise
+            voice.complain("mipmap-plugin: out of memory; use a smaller scale, fewer views or smaller cameras")
+            return 2
     return 0
 
 

@@ -18,7 +18,7 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.optimization import loop
+from mipmap_plugin.adaptation.optimization import loop, resume
 from mipmap_plugin.adaptation.optimization.budget import Pace
 from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.interrupt import interruptible
@@ -35,6 +35,7 @@ from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
+from mipmap_plugin.process import signals
 from mipmap_plugin.recipes import DEFAULT_IN
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
@@ -198,11 +199,37 @@ def test_a_resumed_default_run_equals_an_uninterrupted_one(tmp_path, ctrl_c, nth
     assert [(p.step, p.psnr_db, p.gaussians) for p in resumed.report.curve] == [(p.step, p.psnr_db, p.gaussians) for p in whole.report.curve]
 
 
-def test_a_second_ctrl_c_ends_a_step_without_saving(tmp_path, monkeypatch):
+@pytest.fixture
+def slowly(monkeypatch):
+    """Ctrl-C is never pressed twice in a second."""
+    monkeypatch.setattr(signals, "TWICE_S", 0.0)
+
+
+def test_a_second_ctrl_c_ends_a_step_without_saving(tmp_path, monkeypatch, slowly):
     pressing.in_step(monkeypatch, lambda: [signal.raise_signal(signal.SIGINT) for _ in range(2)])(3)
     with pytest.raises(KeyboardInterrupt) as ended:
         wrapped().adapt(1 / 4, resume=tmp_path / "run.resume", **BRIEF)
     assert not isinstance(ended.value, Interrupted) and not (tmp_path / "run.resume").exists()
+
+
+def test_ctrl_c_twice_in_a_second_is_once(tmp_path, monkeypatch):
+    pressing.in_step(monkeypatch, lambda: [signal.raise_signal(signal.SIGINT) for _ in range(3)])(3)
+    with pytest.raises(Interrupted, match="interrupted at step 3; run the same command again"):
+        wrapped().adapt(1 / 4, resume=tmp_path / "run.resume", **BRIEF)
+
+
+def test_a_second_ctrl_c_while_the_state_is_saved_does_not_lose_it(tmp_path, monkeypatch, ctrl_c, slowly):
+    whole, save = wrapped().adapt(1 / 4, **BRIEF), resume.save_torch
+
+    def pressed(*words, **options):
+        signal.raise_signal(signal.SIGINT)
+        save(*words, **options)
+
+    ctrl_c(3)
+    with monkeypatch.context() as saving, pytest.raises(Interrupted, match="interrupted at step 3; run the same command again"):
+        saving.setattr(resume, "save_torch", pressed)
+        wrapped().adapt(1 / 4, resume=tmp_path / "run.resume", **BRIEF)
+    assert torch.equal(shown(wrapped().adapt(1 / 4, resume=tmp_path / "run.resume", **BRIEF)), shown(whole))
 
 
 def test_ctrl_c_after_the_last_step_is_heard(tmp_path, monkeypatch):
@@ -362,11 +389,10 @@ def test_ctrl_c_without_a_file_to_resume_from_says_so(ctrl_c):
         wrapped().adapt(1 / 4, **BRIEF)
 
 
-def test_a_second_ctrl_c_is_immediate_and_the_old_handler_comes_back():
+def test_a_second_ctrl_c_is_immediate_and_the_old_handler_comes_back(slowly):
     before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt), interruptible() as interrupted:
+    with pytest.raises(KeyboardInterrupt), interruptible():
         signal.raise_signal(signal.SIGINT)
-        assert interrupted()
         signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is before
 

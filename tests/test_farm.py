@@ -5,8 +5,10 @@ import os
 import signal
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from contextlib import nullcontext
 from dataclasses import replace
+from importlib.metadata import PackageNotFoundError
 from types import SimpleNamespace
 
 import pytest
@@ -14,6 +16,7 @@ import tiny
 from running import saving_often, wait_until
 
 from mipmap_plugin.cli import main
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job
@@ -167,9 +170,56 @@ def test_that_no_worker_is_there_is_said_once(monkeypatch, capsys):
     looks = []
     client = SimpleNamespace(cluster=None, scheduler_info=lambda n_workers: looks.append(n_workers) or {"workers": {}})
     monkeypatch.setattr(farm, "LOOK_S", 0.001)
-    with farm._kept_workers(client, "tcp://somewhere:8786"):
+    with farm._kept_workers(client, "tcp://somewhere:8786", lambda: None):
         wait_until(lambda: len(looks) > 4)
     assert capsys.readouterr().err.count("there are no workers") == 1
+
+
+@pytest.mark.parametrize("leave", ["before", "after"])
+def test_ctrl_c_does_not_wait_for_workers_that_are_gone(tmp_path, monkeypatch, leave):
+    """Neither where they left before, nor where they leave without having done what was asked of them."""
+    from mipmap_plugin.jobs import farm
+
+    there, jobs, futures = {"workers": {"tcp://a:1": {}}}, [Job(Base(tmp_path / "base"), tmp_path / "out.ply", 0.5)], []
+
+    class Waiting(Future):  # of the standard library, with what dask's has
+        status = "cancelled"
+
+    def cancel(given):
+        for future in given:
+            if not future.cancelled() and future.cancel():
+                future.set_running_or_notify_cancel()
+
+    def pressed(pending):
+        if not asked:
+            asked.append(there["workers"].clear() if leave == "before" else None)
+            raise KeyboardInterrupt
+        there["workers"].clear()
+        return as_completed(pending, timeout=5)
+
+    asked: list[object] = []
+    client = SimpleNamespace(
+        cluster=None, scheduler_info=lambda n_workers: there, wait_for_workers=lambda count: None, run=lambda *_, **__: {},
+        submit=lambda *_, **__: futures.append(Waiting()) or futures[-1], cancel=cancel,
+    )  # fmt: skip
+    monkeypatch.setattr(farm, "_connected", lambda place: nullcontext(client))
+    monkeypatch.setattr(farm, "Event", lambda *_, **__: SimpleNamespace(name="stop", set=lambda: None))
+    monkeypatch.setattr(farm, "as_completed", pressed)
+    monkeypatch.setattr(farm, "LOOK_S", 0.01)
+    outcomes = []
+    with pytest.raises(KeyboardInterrupt):
+        outcomes.extend(farm.on_dask(jobs, "tcp://somewhere:8786"))
+    assert futures[0].cancelled() and [outcome.status for outcome in outcomes] == ["interrupted"] * (leave == "after")
+
+
+@pytest.mark.parametrize("theirs, told", [("0.0.1", "has mipmap-plugin 0.0.1"), (PackageNotFoundError("mipmap-plugin"), "lacks mipmap-plugin")])
+def test_workers_of_another_version_are_refused(monkeypatch, theirs, told):
+    from mipmap_plugin.jobs import farm
+
+    monkeypatch.setattr(farm, "version", lambda name: "0.1.0")
+    client = SimpleNamespace(run=lambda *_, **__: {"tcp://a:1": "0.1.0", "tcp://b:2": theirs, "tcp://c:3": OSError("it has left")})
+    with pytest.raises(SettingsError, match=f"--dask farm: the worker tcp://b:2 {told}, and this is 0.1.0; install that version there too"):
+        farm._refuse_other_versions(client, "farm")
 
 
 @pytest.mark.parametrize("place", ["tcp://127.0.0.1:1", "local:0", "nonsense"])

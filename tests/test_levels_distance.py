@@ -10,6 +10,7 @@ from itertools import pairwise
 import pytest
 import tiny
 import torch
+from torch.overrides import TorchFunctionMode
 
 from mipmap_plugin import cli, load_model, wrap_model
 from mipmap_plugin.adaptation.optimization.validation import Validation
@@ -146,6 +147,21 @@ def test_chunks_are_small_or_have_few_splats_and_every_splat_is_in_its_box():
     for number in range(len(chunks)):
         means = splats.means[place == number]
         assert len(means) <= 10 or (means.amax(0) - means.amin(0)).max() <= 0.5
+
+
+def test_boxes_are_made_from_the_reach_of_all_splats_once():
+    """And not once for each of thousands of chunks, which took longer than all else of a scene of a million."""
+    splats, counted = tiny.gaussians(400), []
+
+    class Counting(TorchFunctionMode):
+        def __torch_function__(self, function, types, arguments=(), options=None):
+            made = function(*arguments, **(options or {}))
+            counted.append(made.shape == splats.means.shape if isinstance(made, torch.Tensor) else False)
+            return made
+
+    with Counting():
+        chunks = Chunks.of(splats, extent=0.1, least=4)
+    assert sum(counted) < 20 < len(chunks)
 
 
 def test_a_distance_is_that_to_the_nearest_point_of_a_box():
@@ -395,7 +411,7 @@ def test_what_takes_long_is_announced(small_chunks, monkeypatch):
     for module in ("ladder", "level"):
         monkeypatch.setattr(f"mipmap_plugin.levels.distance.{module}.announced", lambda what: (told.append(what), nullcontext())[1])
     wrapped().levels("classic", by="distance", coarsest=1 / 2, ratio=2.0, **BRIEF)
-    assert told == ["level 1: choosing views", "level 1: merging", "level 1: validation", "measuring the levels"]
+    assert told == ["cutting the scene into chunks", "level 1: choosing views", "level 1: merging", "level 1: validation", "measuring the levels"]
 
 
 def test_a_level_that_is_worse_than_the_finer_one_says_so(small_chunks, monkeypatch):

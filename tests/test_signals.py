@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
 import sys
+import time
 import zipfile
 
 import pressing
@@ -15,7 +17,7 @@ import tiny
 from mipmap_plugin.cli import main
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job
-from mipmap_plugin.jobs.worker import Worker, do
+from mipmap_plugin.jobs.worker import Worker, WorkerDied, do
 from mipmap_plugin.process import signals
 from mipmap_plugin.process.signals import ends_as_by_ctrl_c
 
@@ -39,6 +41,7 @@ sys.exit(code)
 @pytest.fixture(autouse=True)
 def _usual_signals():
     before = {number: signal.getsignal(number) for number in (*signals.SIGNALS, signal.SIGINT)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     for number in signals.SIGNALS:
         signal.signal(number, signal.SIG_DFL)  # also where these tests are run by nohup
     yield
@@ -86,6 +89,38 @@ def test_a_second_signal_counts_when_the_first_is_long_ago(monkeypatch):
     assert len(heard) == 2
 
 
+def test_ctrl_c_twice_in_a_second_does_not_break_off_what_the_first_one_removes(monkeypatch):
+    now = iter([100.0, 100.0 + signals.TWICE_S / 2, 101.0 + signals.TWICE_S])
+    monkeypatch.setattr(signals.time, "monotonic", lambda: next(now))
+    removed = []
+    with pytest.raises(KeyboardInterrupt), ends_as_by_ctrl_c():
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            signal.raise_signal(signal.SIGINT)
+            removed.append(True)
+            signal.raise_signal(signal.SIGINT)
+    assert removed and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_is_heard_where_the_first_was_lost():
+    with pytest.raises(KeyboardInterrupt), ends_as_by_ctrl_c():
+        with contextlib.suppress(KeyboardInterrupt):  # as Python does where it imports or finalizes
+            signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("it went on")
+
+
+@pytest.mark.parametrize(("when", "code", "err"), [("import tyro", 130, "mipmap-plugin: interrupted\n"), ("atexit", 0, "")])
+def test_ctrl_c_before_and_after_a_command_is_no_traceback(when, code, err):
+    press = "lambda *_: signal.raise_signal(signal.SIGINT)"
+    lines = {"import tyro": f"sys.meta_path.insert(0, types.SimpleNamespace(find_spec={press}))", "atexit": f"atexit.register({press})"}
+    script = f"import atexit, signal, sys, types; sys.argv[1:] = ['--version']; import mipmap_plugin.__main__ as ours\n{lines[when]}\n"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = subprocess.run([sys.executable, "-c", script + "sys.exit(ours.run())"], env=environment, capture_output=True, text=True)
+    assert (abs(ended.returncode), ended.stderr) == (code, err)
+
+
 def test_it_ends_also_where_ctrl_c_is_ignored():
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with pytest.raises(KeyboardInterrupt), ends_as_by_ctrl_c() as told:
@@ -105,6 +140,20 @@ def test_nothing_is_changed_afterwards():
         pass
     assert [signal.getsignal(number) for number in signals.SIGNALS] == [signal.SIG_DFL] * len(signals.SIGNALS)
     assert told.code == signals.INTERRUPTED
+
+
+@pytest.mark.parametrize("seconds", [0.05, 0.1, 0.2, 0.3])
+def test_a_worker_that_is_stopped_while_it_starts_says_nothing(tmp_path, capfd, seconds):
+    worker = Worker(1)
+    try:
+        worker.begin(Job(Base(tmp_path / "base"), tmp_path / "out.ply", 0.5))
+        time.sleep(seconds)
+        worker.stop()
+        with pytest.raises(WorkerDied):
+            worker.outcome()
+    finally:
+        worker.close()
+    assert capfd.readouterr().err == ""
 
 
 def test_a_job_whose_worker_is_told_to_end_is_done_again(tmp_path, monkeypatch):

@@ -169,6 +169,15 @@ def test_long_work_is_announced_on_a_terminal_alone(terminal, patience, line, mo
     assert line in errors.getvalue() and bool(errors.getvalue()) == bool(line)
 
 
+def test_what_takes_seconds_of_a_large_scene_is_announced(tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    monkeypatch.setattr(progress, "_show", lambda what, ended: told.append(what))
+    wrapped = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="cpu", threads=1)
+    wrapped.adapt(1 / 2, recipe="instant").save(tmp_path / "new.ply")
+    assert {"examining views", "writing new.ply"} <= set(told)
+
+
 def test_the_clock_of_a_bar_goes_on_while_nothing_is_counted(monkeypatch):
     monkeypatch.setattr(progress, "PATIENCE", 0.01)
     errors = Terminal()

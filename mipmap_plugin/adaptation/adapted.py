@@ -101,7 +101,8 @@ class Adapted:
         refuse_output(path, overwrite, parts_of(self.model.source, self.model.folder))  # whatever the family itself looks at
         with together(path), naming_any({f"family {self.model.family!r}": self.model}):  # a new model never appears without its report
             model = for_loader_of(self.report.viewer, self.model, path)
-            saved = contract.save(model, path, self.report.provenance(), overwrite=overwrite)
+            with announced(f"writing {path.name}"):
+                saved = contract.save(model, path, self.report.provenance(), overwrite=overwrite)
             self._judge(saved)
             write_json(saved.with_name(saved.name + REPORT), self.report_of(saved).model_dump(), overwrite=overwrite)
         for state in self.states:

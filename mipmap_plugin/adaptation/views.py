@@ -22,6 +22,7 @@ from mipmap_plugin.limits import derived_seed
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.contract import row_opacities
 from mipmap_plugin.models.health import units
+from mipmap_plugin.progress import announced
 from mipmap_plugin.render_settings import MIN_ALPHA
 from mipmap_plugin.scenes import unread_cameras
 from mipmap_plugin.scenes.orbits import FRAMED, GOLDEN, ORBIT_FOV, Orbit
@@ -162,6 +163,7 @@ def choose_views(cameras: Sequence[Camera], viewpoints: Viewpoints, config: Adap
     return views, f"the {len(views)} {split} views"
 
 
+@announced("examining views")
 def showing(views: Sequence[Camera], means: Tensor, near: float) -> list[Camera]:
     """The views that show one of the `means` [N, 3], farther than the near plane (world units)."""
     shown = [inside.any(1) for inside in _inside(views, means, near)]
@@ -174,6 +176,7 @@ def _inside(views: Sequence[Camera], means: Tensor, near: float) -> Iterator[Ten
         yield view.in_picture(view.to_camera(means.detach()), near)
 
 
+@announced("examining views")
 def refuse_blind(views: Sequence[Camera], model: SplatModel, near: float, image_of: Callable[[Camera], Tensor], scale: float = 1.0) -> None:
     """Raise SettingsError for views that show nothing, or a speck: of cameras of another scene, or of splats that no renderer draws, for example.
 
@@ -250,6 +253,7 @@ def orbited(source: Path | None, orbit: Orbit) -> str:
     return f"{ORBITED.format(told=orbit.told(), seems='' if whole else CAPTURE)}{beside}{others}"
 
 
+@announced("examining views")
 def remarks(views: Sequence[Camera], model: SplatModel, near: float, *, orbit: bool) -> list[str]:
     """What is wrong with a scene in views that show something, in sentences. `near`: the near plane, in world units; `orbit`: they were generated."""
     least = LEAST_SHARE * min(views[0].size)

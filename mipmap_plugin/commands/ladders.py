@@ -72,8 +72,10 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
 
     unfinished = state_path(output)
     refuse_ladder(output, wrapped, overwrite=overwrite)
-    refuse_ladder(output, wrapped, overwrite=overwrite, room=room_for(wrapped, request, unfinished))
-    if exports.streamed_sog and (bound := _ends_at_once(wrapped, request)):
+    with announced("planning the levels"):
+        refuse_ladder(output, wrapped, overwrite=overwrite, room=room_for(wrapped, request, unfinished))
+        bound = _ends_at_once(wrapped, request) if exports.streamed_sog else ""
+    if bound:
         raise SettingsError(f"{SINGLE_LEVEL}; give a smaller {bound}, or leave --streamed-sog out")
     if exports.tiles and not wrapped.model.traits.no_viewer:
         refuse_far(output, wrapped.model.parameters()["means"], "leave --tiles out")
@@ -83,7 +85,7 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     if exports.streamed_sog and len(ladder.levels) == 1:
         # Other numbers would make another ladder, and a smaller --coarsest may make more levels that are left out.
         raise SettingsError(f"{SINGLE_LEVEL}; leave --streamed-sog out, which goes on from what is made")
-    with _kept(unfinished):
+    with _kept(unfinished), announced(f"writing {output.name}"):
         folder = ladder.save(output, overwrite=overwrite, keep_resume=True)  # an export may fail after minutes, and the levels took longer
     try:
         with threads.limited_for(wrapped.backend()[0], wrapped.threads):

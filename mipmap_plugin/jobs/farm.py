@@ -16,6 +16,7 @@ import uuid
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import dask
@@ -28,6 +29,8 @@ from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.parcel import Delivery, Parcel, do_parcel, pack, unpack
 from mipmap_plugin.jobs.worker import Worker, do
 from mipmap_plugin.progress import note
+
+PACKAGE = "mipmap-plugin"
 
 # Seconds between two looks at whether jobs are to stop; to reach a scheduler; between two looks at whether there are workers.
 PERIOD_S, CONNECT_S, LOOK_S = 1.0, 20.0, 10.0
@@ -47,6 +50,9 @@ SENT_PER_WORKER = 2
 # takes too much memory ends our worker, not dask's: so these are workers that others ended, as clouds and batch systems do.
 HANDED_OUT = 5
 
+# Why there is no outcome of a task that nobody does any more.
+LOST = "the connection to the scheduler was lost"
+
 _mine = threading.local()
 
 
@@ -56,11 +62,13 @@ def on_dask(jobs: Sequence[Job], place: str, threads: int | None = None, *, send
     `threads`: of each job; of all jobs together for local:n. `send_files`: send checkpoints and get back what was made of them, also where workers
     see them; otherwise that is done if some worker does not see the first checkpoint. If any worker declares GPUs (`--resources GPU=1`), each job
     takes one.
-    Ctrl-C lets every running job save its state, and begins no other. Raises SettingsError for a place where there is no scheduler.
+    Ctrl-C lets every running job save its state, and begins no other. Raises SettingsError for a place where there is no scheduler, or workers that
+    lack this package or have another version of it.
     """
-    jobs = longest_first(jobs)
-    with _connected(place) as client, _kept_workers(client, place):
+    jobs, stopping, given = longest_first(jobs), threading.Event(), list[Future[Outcome | Delivery]]()
+    with _connected(place) as client, _kept_workers(client, place, lambda: stopping.is_set() and client.cancel(given)):
         client.wait_for_workers(1)  # which says whether files have to be sent, and whether there are GPUs
+        _refuse_other_versions(client, place)
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
         needs = {"GPU": 1} if any("GPU" in worker.get("resources", {}) for worker in workers) else None
         share = max(1, (threads or usable_threads()) // len(workers)) if place.startswith("local:") else threads
@@ -68,16 +76,37 @@ def on_dask(jobs: Sequence[Job], place: str, threads: int | None = None, *, send
         stop = Event(f"stop-{uuid.uuid4().hex}", client=client)
 
         def submit(sent: Any) -> Future[Outcome | Delivery]:
-            return client.submit(_task, sent, share, stop.name, key=f"adapt-{uuid.uuid4().hex}", pure=False, resources=needs)
+            given.append(client.submit(_task, sent, share, stop.name, key=f"adapt-{uuid.uuid4().hex}", pure=False, resources=needs))
+            return given[-1]
+
+        def end() -> None:
+            stopping.set()
+            stop.set()
+            if not client.scheduler_info(n_workers=1)["workers"]:  # who would end them
+                client.cancel(given)
 
         together = SENT_PER_WORKER * max(1, len(workers)) if send_files else max(1, len(jobs))
         try:
             for first in range(0, len(jobs), together):  # files that are sent wait in the workers' memory, so that not all are sent at once
                 done, todo = _sent(jobs[first : first + together], client) if send_files else ([], [(job, job) for job in jobs])
                 yield from done
-                yield from _outcomes(todo, submit, stop.set)
+                for outcome in _outcomes(todo, submit, end):
+                    lost = stopping.is_set() and outcome.reason == LOST
+                    yield replace(outcome, status="interrupted", reason="interrupted") if lost else outcome
         finally:
             stop.set()
+
+
+def _refuse_other_versions(client: Client, place: str) -> None:
+    """Raise SettingsError for workers that lack this package, whom a job would end, or that have another version, which adapts otherwise."""
+    try:
+        ours = version(PACKAGE)
+    except PackageNotFoundError:  # of a source tree, of which no version is known
+        return
+    for address, theirs in client.run(version, PACKAGE, on_error="return").items():
+        if isinstance(theirs, PackageNotFoundError) or (isinstance(theirs, str) and theirs != ours):
+            told = f"has {PACKAGE} {theirs}" if isinstance(theirs, str) else f"lacks {PACKAGE}"
+            raise SettingsError(f"--dask {place}: the worker {address} {told}, and this is {ours}; install that version there too")
 
 
 def _outcomes(todo: Sequence[tuple[Job, Any]], submit: Callable[[Any], Future[Any]], stop: Callable[[], None]) -> Generator[Outcome, None, None]:
@@ -142,7 +171,7 @@ def _outcome(future: Future[Outcome | Delivery], job: Job) -> Outcome:
         except (MipmapPluginError, OSError) as refusal:
             return Outcome(job, "failed", reason=str(refusal))
     error = future.exception() if future.status == "error" else None
-    reason = f"{type(error).__name__}: {error}" if error else "the connection to the scheduler was lost"
+    reason = f"{type(error).__name__}: {error}" if error else LOST
     return Outcome(job, "failed", reason=reason)
 
 
@@ -166,8 +195,9 @@ def _connected(place: str) -> Iterator[Client]:
 
 
 @contextmanager
-def _kept_workers(client: Client, place: str) -> Iterator[None]:
-    """Inside, a line says when there are no workers, at two looks in a row. Workers of this machine that died are replaced.
+def _kept_workers(client: Client, place: str, forsaken: Callable[[], object]) -> Iterator[None]:
+    """Inside, a line says when there are no workers, at two looks in a row; `forsaken` is called at each. Workers of this machine that died are
+    replaced.
 
     dask does so itself, but for a worker that dies while it starts.
     """
@@ -180,6 +210,8 @@ def _kept_workers(client: Client, place: str) -> Iterator[None]:
                 client.cluster.scale(len(client.cluster.worker_spec))
             with suppress(OSError, asyncio.TimeoutError):  # a scheduler that cannot be reached now is found again, or ends the jobs
                 looks = 0 if client.scheduler_info(n_workers=1)["workers"] else looks + 1
+                if looks:
+                    forsaken()
                 if looks == 2:
                     note(f"--dask {place}: there are no workers, so nothing is done until one comes; Ctrl-C ends this, and the same command goes on")
 

@@ -28,6 +28,8 @@ Request = tuple[Job, "int | None"]
 def main() -> None:
     """Do the jobs that come on standard input, and write their outcomes to standard output, until the owner closes it."""
     signal.signal(signal.SIGINT, _leave)
+    if hasattr(signal, "pthread_sigmask"):  # not on Windows
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # which its owner has blocked until now
     with ends_as_by_ctrl_c() as ending:
         _serve(ending)
 

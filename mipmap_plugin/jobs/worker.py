@@ -7,7 +7,8 @@ import pickle
 import signal
 import subprocess
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import IO, cast
 
@@ -105,7 +106,21 @@ def _start(threads: int | None) -> subprocess.Popen[bytes]:
     """Start a worker, in a session of its own: its owner alone tells it of Ctrl-C."""
     limits = {} if threads is None else dict.fromkeys(THREAD_VARIABLES, str(threads))
     command = [sys.executable, "-m", "mipmap_plugin.jobs.serve"]
-    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env={**os.environ, **limits}, start_new_session=True)
+    with _ctrl_c_waits():
+        return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env={**os.environ, **limits}, start_new_session=True)
+
+
+@contextmanager
+def _ctrl_c_waits() -> Iterator[None]:
+    """What this thread starts inside hears Ctrl-C once it says so (`serve`), and not while it imports, where Python would tell of that."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _close(process: subprocess.Popen[bytes]) -> None:

@@ -22,6 +22,7 @@ from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import Filtered, SplatModel, digest_of_model
 from mipmap_plugin.models.places import REPORT, STATE, state_path
+from mipmap_plugin.progress import announced
 
 # Written before the first level: what was broken off earlier leaves the state of a run at most.
 REQUEST = "request.json"
@@ -65,7 +66,8 @@ class LevelStore:
             self._refuse_others(self._folder)
             write_json(self._folder / REQUEST, self._facts, overwrite=True)
             made.save(file, overwrite=True)
-        return self._loaded(file)
+        with announced(f"reading {file.name}"):
+            return self._loaded(file)
 
     def remove(self) -> None:
         """Delete the folder, whose levels have been saved elsewhere."""

@@ -4,6 +4,7 @@ gone on from, and removes what is temporary. For commands, not for libraries: si
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -16,8 +17,26 @@ SIGNALS = [signal.Signals[name] for name in ("SIGTERM", "SIGHUP") if name in sig
 # Seconds in which further ones count as the same: `timeout` sends its signal to the process, and again to its group.
 SAME_S = 5.0
 
+# Seconds in which a further Ctrl-C counts as the same: an impatient hand presses twice, before it can see what the first one did.
+TWICE_S = 1.0
+
 # The exit code of a process that was interrupted by Ctrl-C. Of one that another signal ended it is 128 more than the signal's number.
 INTERRUPTED = 130
+
+
+class Presses:
+    """When Ctrl-C was pressed."""
+
+    def __init__(self) -> None:
+        self._at = -TWICE_S
+
+    def is_new(self) -> bool:
+        """Whether this press is another one than the last that was new."""
+        now = time.monotonic()
+        if now - self._at < TWICE_S:
+            return False
+        self._at = now
+        return True
 
 
 class Ending:
@@ -27,6 +46,15 @@ class Ending:
 
     def __init__(self) -> None:
         self._heard_at = -SAME_S
+        self._presses = Presses()
+
+    def pressed(self, number: int, frame: FrameType | None) -> None:
+        """Raise KeyboardInterrupt, but not a second time in the middle of what the first one has removed or kept.
+
+        The first one may be lost, as where Python imports or finalizes; then the second one has to be heard.
+        """
+        if self._presses.is_new() or not isinstance(sys.exc_info()[1], KeyboardInterrupt):
+            raise KeyboardInterrupt
 
     def heard(self, number: int, frame: FrameType | None) -> None:
         """Do what Ctrl-C does now; also where that is ignored, as by what a script starts in the background."""
@@ -42,7 +70,10 @@ class Ending:
 
 @contextmanager
 def ends_as_by_ctrl_c() -> Iterator[Ending]:
-    """Inside, the signals that would end this process at once do what Ctrl-C does, but for those that it ignores already, as by `nohup`."""
+    """Inside, the signals that would end this process at once do what Ctrl-C does, but for those that it ignores already, as by `nohup`.
+
+    Ctrl-C raises KeyboardInterrupt, as Python has it, but not again within TWICE_S while the first one is dealt with.
+    """
     ending = Ending()
     if threading.current_thread() is not threading.main_thread():  # signals reach only the main thread
         yield ending
@@ -50,8 +81,12 @@ def ends_as_by_ctrl_c() -> Iterator[Ending]:
     changed = [number for number in SIGNALS if signal.getsignal(number) == signal.SIG_DFL]
     for number in changed:
         signal.signal(number, ending.heard)
+    if ours := signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, ending.pressed)
     try:
         yield ending
     finally:
+        if ours:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         for number in changed if ending.code == INTERRUPTED else ():  # or the second one would end it before all is removed
             signal.signal(number, signal.SIG_DFL)

@@ -7,27 +7,36 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from mipmap_plugin.process.signals import Presses
+
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Inside, Ctrl-C is only recorded, and the yielded function returns whether it was pressed.
+    """Inside, Ctrl-C is only recorded, and the yielded function returns whether it was pressed since it was last called.
 
-    A second one raises KeyboardInterrupt as soon as Python runs, after a call of a kernel, in the middle of a step or of what the first one saves:
-    of the run is left what was saved before.
+    A second one that is not the same (`Presses`) raises KeyboardInterrupt as soon as Python runs, after a call of a kernel, in the middle of a step:
+    of the run is left what was saved before. One while what the first one asked for is done, such as saving, is only recorded again.
     """
-    pressed = False
+    presses, pressed = Presses(), False
 
     def record(number: int, frame: object) -> None:
         nonlocal pressed
+        if not presses.is_new():
+            return
         if pressed:
             raise KeyboardInterrupt
         pressed = True
+
+    def heard() -> bool:
+        nonlocal pressed
+        was, pressed = pressed, False
+        return was
 
     if threading.current_thread() is not threading.main_thread():  # signals reach only the main thread
         yield lambda: False
         return
     before = signal.signal(signal.SIGINT, record)
     try:
-        yield lambda: pressed
+        yield heard
     finally:
         signal.signal(signal.SIGINT, before)

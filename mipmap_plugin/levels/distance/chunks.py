@@ -52,8 +52,9 @@ class Chunks:
             return number
 
         cut(torch.arange(len(means), device=means.device))
-        low = torch.stack([(means - reach)[rows].amin(0) for rows in leaves])
-        high = torch.stack([(means + reach)[rows].amax(0) for rows in leaves])
+        lows, highs = means - reach, means + reach
+        low = torch.stack([lows[rows].amin(0) for rows in leaves])
+        high = torch.stack([highs[rows].amax(0) for rows in leaves])
         middle, half = (low + high) / 2, shrunk((high - low) / 2)
         return cls(cuts, middle - half, middle + half)
 

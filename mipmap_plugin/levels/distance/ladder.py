@@ -41,8 +41,9 @@ def make_levels_by_distance(base: FrozenBase, request: LadderRequest, resume: st
     merged, or for settings that levels by distance do not have."""
     refuse(base, request)
     band = request.first_band(base.target(request.viewer), base.effects())
-    scene = scene_of(base, request, band)
-    store = LevelStore(None if resume is None else Path(resume), base, request)
+    with announced("cutting the scene into chunks"):
+        scene = scene_of(base, request, band)
+        store = LevelStore(None if resume is None else Path(resume), base, request)
     first = store.level("level_0", lambda state: _first(base, request, band, state))
     with threads.limited_for(scene.backend, base.threads):
         levels = [first]
