@@ -94,12 +94,12 @@ class Adapted:
         facts = notebook.adapted_facts(self.model, self.report)
         return notebook.table("Adapted", facts, lambda camera: self.render(camera).image, self.views()[0])
 
-    @usual_modes()
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""
         path = path_of(path)
         refuse_output(path, overwrite, parts_of(self.model.source, self.model.folder))  # whatever the family itself looks at
-        with together(path), naming_any({f"family {self.model.family!r}": self.model}):  # a new model never appears without its report
+        family = {f"family {self.model.family!r}": self.model}
+        with usual_modes(), together(path), naming_any(family):  # a new model never appears without its report
             model = for_loader_of(self.report.viewer, self.model, path)
             with announced(f"writing {path.name}"):
                 saved = contract.save(model, path, self.report.provenance(), overwrite=overwrite)
