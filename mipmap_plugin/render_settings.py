@@ -99,7 +99,7 @@ class RenderSettings:
         min_contribution: px², after dilation: splats whose opacity · sqrt(det) is less are culled.
         rooted: `min_contribution` is compared with sqrt(opacity · det) instead.
         least_spread: px², after dilation: minimum distance of variances from their mean; splats whose smaller one becomes 0 are culled.
-        level_below: px²: those whose |xy| is less are stretched along (1, up) instead of (xy, up) (`splatting.culls`).
+        level_below: px²: those whose |xy| is less are stretched along (√10 · least_spread, up) instead of (xy, up) (`splatting.culls`).
         max_half_axis: px, at `radius`: longer half-axes are shortened to this; with `boxed` the whole splat shrinks before.
         fits_picture: Half-axes are also limited to the picture's shorter side.
         packing: Quantization of splats in memory.
