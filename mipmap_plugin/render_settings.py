@@ -99,12 +99,12 @@ class RenderSettings:
         min_contribution: px², after dilation: splats whose opacity · sqrt(det) is less are culled.
         rooted: `min_contribution` is compared with sqrt(opacity · det) instead.
         least_spread: px², after dilation: minimum distance of variances from their mean; splats whose smaller one becomes 0 are culled.
-        level_below: px²: those whose |xy| is less are stretched along (1, up) instead of (xy, up) (`splatting.culls`).
+        level_below: px²: those whose |xy| is less are stretched along (√10 · least_spread, up) instead of (xy, up) (`splatting.culls`).
         max_half_axis: px, at `radius`: longer half-axes are shortened to this; with `boxed` the whole splat shrinks before.
         fits_picture: Half-axes are also limited to the picture's shorter side.
         packing: Quantization of splats in memory.
         frozen_beyond: The Jacobian is frozen so far outside the picture, in halves of its width and height; infinity: nowhere.
-        frozen_by_width: So far from the axis of view as a picture that is centered and square reaches instead, by its width.
+        frozen_by_width: It is frozen 1 + `frozen_beyond` half widths from the axis of view instead, along y too.
         frame: In halves of the picture from its middle: splats whose center lies farther out along x or y are not rendered.
         linear_light: Splats are blended in linear light: colors to this power; the picture is sRGB of what comes out.
         picture_step: The picture is rounded to multiples after each splat, back to front; the gradient ignores the rounding.

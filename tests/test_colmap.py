@@ -9,7 +9,8 @@ import pytest
 import torch
 from PIL import Image
 
-from mipmap_plugin.errors import SceneError
+from mipmap_plugin.adaptation.target.photographs import Photographs
+from mipmap_plugin.errors import SceneError, SettingsError
 from mipmap_plugin.scenes import load_photographs, load_scene
 
 pycolmap = pytest.importorskip("pycolmap", reason="COLMAP scenes are read by pycolmap, an extra")
@@ -94,6 +95,19 @@ def test_copies_are_the_photographs_where_there_are_no_others(tmp_path, cfg):
     assert list(scene.images.values()) == [tmp_path / "images_4/000.png"] and scene.smaller(8) == (8, 6)
     assert scene.image(scene.cameras[0], (0, 0, 0)).shape == (10, 14, 3)
     assert any(note == "there is no folder images: the photographs are those of images_4" for note in scene.notes)
+
+
+def test_a_wide_lens_makes_photographs_larger_when_they_are_undistorted(tmp_path):
+    """A training on the undistorted ones is adapted to the whole ones, but not to copies."""
+    write_text_model(tmp_path / "sparse/0", names(2), "SIMPLE_RADIAL", "40 32 24 -0.2")
+    write_photographs(tmp_path / "images", names(2))
+    scene = load_scene(tmp_path)
+    [view] = Photographs(scene, scene.cameras, (0, 0, 0)).cameras
+    assert (view.width, view.height) == (77, 51)
+    (tmp_path / "images").rename(tmp_path / "images_2")
+    write_photographs(tmp_path / "images_2", names(2), size=(32, 24))
+    with pytest.raises(SettingsError, match="has 38 x 26 px, but the base was trained at 77 x 51 px"):
+        Photographs(load_scene(tmp_path), scene.cameras, (0, 0, 0))
 
 
 def test_photographs_that_were_turned_are_refused(tmp_path):

@@ -72,5 +72,5 @@ def test_a_viewer_that_keeps_positions_in_16_bits_does_not_suit_a_scene_out_ther
 def test_adapting_for_such_a_viewer_warns():
     splats, view = tiny.gaussians(), cameras(1, width=8, height=6)[0]
     far = wrap_model(VanillaModel.from_gaussians(replace(splats, means=splats.means + FAR.float())), cameras=[moved(view)], backend="reference")
-    with pytest.warns(UserWarning, match="spark keeps positions in 16 bits"):
+    with pytest.warns(UserWarning, match="spark keeps positions in 16 bits.*the world.s origin, with its cameras, or give another viewer"):
         far.adapt(1 / 2, recipe="instant", merge_to=1.0, viewer="spark", views="given", validation_views=2)

@@ -25,6 +25,7 @@ from mipmap_plugin.render_settings import USUAL, EvenBuckets, Packing, RenderSet
 from mipmap_plugin.splatting.buckets import even_ranks, ranks, ranks_of_views
 from mipmap_plugin.splatting.packing import in_two_steps, packed
 from mipmap_plugin.splatting.viewers import BUILT_IN, EDGE, Viewer, find_viewer
+from mipmap_plugin.viewing.sources import coarser
 from mipmap_plugin.wrap import Wrapped
 
 C0 = 0.28209479177387814
@@ -209,6 +210,14 @@ def test_programs_that_took_its_eigenvalues_stretch_splats_or_drop_them(backend)
         assert (alpha(backend, viewer, small).max() == 0) == (viewer != "metalsplatter")
     assert alpha(backend, "vk-gaussian-splatting", a_little_larger).max() > 0
     assert alpha(backend, "gdgs", splat(0.0326, 1e-6)).max() > 0  # a needle of that mean
+
+
+@BOTH
+@pytest.mark.parametrize("viewer", ["gaussian-splats-3d", "metalsplatter", "vk-gaussian-splatting"])
+def test_a_splat_is_stretched_the_same_way_with_more_pixels(backend, viewer):
+    effects, round_one, finer = find_viewer(viewer).effects(Effects(0)), splat(1.0, 1.0, 0.8), camera().resized(3 * SIZE, 3 * SIZE)
+    more = backend.render(round_one, finer, coarser(effects, 3.0)).alpha[1::3, 1::3]  # where the pixels' centers are
+    torch.testing.assert_close(more, backend.render(round_one, camera(), effects).alpha, atol=1e-5, rtol=0)
 
 
 @BOTH

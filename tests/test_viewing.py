@@ -37,7 +37,7 @@ from mipmap_plugin.viewing.controls import MARKS, STOPS, figures, words
 from mipmap_plugin.viewing.pace import COARSEST, MOVING_S, Pace
 from mipmap_plugin.viewing.page import Page, PageSettings
 from mipmap_plugin.viewing.screen import LARGEST_FOV, Sampling, by_distance, by_lens, inside, pose_of, up_of, zoomed
-from mipmap_plugin.viewing.server import NO_VISER, check_address, served, without_words
+from mipmap_plugin.viewing.server import NO_VISER, check_address, foreign_page, served, without_words
 from mipmap_plugin.viewing.sources import File, Levels, Request, Supersampled, of_adapted, open_source
 from mipmap_plugin.viewing.stage import AMPLIFIED, Look, Stage
 
@@ -617,6 +617,12 @@ def test_only_its_own_page_sees_the_scene(server, page, host, taken):
         assert connection.recv(99).split()[1] == (b"101" if taken else b"403")
     ours = [str(each.message) for each in told if each.filename == viewing_server.__file__]
     assert len(ours) == (not taken) and all(f"a page of '{page}' asked".format(port=port) in each for each in ours)
+
+
+@pytest.mark.parametrize(("page", "foreign"), [("https://scenes.example", False), ("https://inner", False), ("https://evil", True), ("null", True)])
+def test_several_proxies_name_their_hosts_in_a_list(page, foreign):
+    headers = {"Origin": page, "Host": "127.0.0.1:8080", "X-Forwarded-Host": "scenes.example, inner", "Upgrade": "websocket"}
+    assert foreign_page(headers) == foreign and foreign_page(headers | {"X-Forwarded-Host": ""})
 
 
 def test_a_browser_that_is_closed_while_its_picture_is_drawn_is_nothing_to_warn_of(monkeypatch):

@@ -60,5 +60,5 @@ def too_far_out(model: SplatModel, views: Sequence[Camera], targets: Mapping[str
         share = float((torch.stack(moved) > splats.scales.abs().amax(1)).double().mean())
         if share > DISPLACED:
             where = f"{viewer} keeps positions in 16 bits, by which {share:.0%} of the splats are off by more than their size, or lost"
-            return f"{where}; move the scene to the world's origin, or scale it down, with its cameras, or give another viewer"
+            return f"{where}; move the scene to the world's origin, with its cameras, or give another viewer"
     return ""

@@ -82,7 +82,7 @@ def refuse_far(path: Path, means: Tensor, instead: str) -> None:
     """Raise SettingsError for centers [N, 3] that SPZ has no place for. `instead`: what else can be done."""
     if far := int((means.detach().abs() >= SPZ_REACH).any(dim=1).sum()):
         where = f"lie {SPZ_REACH:,.0f} or more units from the origin along an axis, where SPZ has no place for them"
-        raise SettingsError(f"{path}: {far:,} of {len(means):,} splats {where}; move or shrink the scene, or {instead}")
+        raise SettingsError(f"{path}: {far:,} of {len(means):,} splats {where}; remove them, move or shrink the scene, or {instead}")
 
 
 def without_place(path: Path, extras: Iterable[str], sh_degree: int = 0) -> str:

@@ -108,8 +108,20 @@ class Scene:
             within = folder.with_name(name) / first.relative_to(folder)
             for copy in (within, within.with_suffix(".png")):
                 if is_file(copy):
-                    return _undistorted_size(image_size(copy), self.lenses[first], camera) if first in self.lenses else image_size(copy)
+                    return self._undistorted_size(image_size(copy), camera)
         return None
+
+    def image_size(self, camera: Camera) -> tuple[int, int]:
+        """(width, height) px of the photograph of `camera`, undistorted."""
+        return self._undistorted_size(image_size(self.images[camera]), camera)
+
+    def _undistorted_size(self, size: tuple[int, int], camera: Camera) -> tuple[int, int]:
+        """`size` of the photograph of `camera`, or of a copy of it, scaled by the ratio of the undistorted image to the whole one."""
+        whole = self.lenses.get(self.images[camera])
+        if whole is None:
+            return size
+        across, down = camera.width / whole.width, camera.height / whole.height
+        return max(1, round(size[0] * across)), max(1, round(size[1] * down))
 
     def image(self, camera: Camera, background: Sequence[float]) -> Tensor:
         """The photograph of `camera` on `background` (RGB in 0..1), [H, W, 3] float32 at the file's full resolution, undistorted.
@@ -138,9 +150,3 @@ def refuse_other_shape(stated: tuple[int, int], photograph: tuple[int, int], whe
     if abs(math.log(wide * height / (high * width))) > SHAPE_TOLERANCE + 1 / min(width, height):
         advice = "it was turned or cropped since; give the photographs that the cameras were found in, or leave them out"
         raise SceneError(f"{where}: its camera is of {wide} x {high} px, but the photograph has {width} x {height} px: {advice}")
-
-
-def _undistorted_size(size: tuple[int, int], whole: Lens, camera: Camera) -> tuple[int, int]:
-    """`size` of a copy, scaled by the ratio of the undistorted `camera` to the `whole` photograph."""
-    across, down = camera.width / whole.width, camera.height / whole.height
-    return max(1, round(size[0] * across)), max(1, round(size[1] * down))

@@ -16,6 +16,10 @@ from mipmap_plugin.render_settings import RenderSettings
 
 STEEPNESS = 4.0
 
+# What stands in place of a level splat's xy, over the least spread: 1 px² over the root of 0.1 px⁴ in vk_gaussian_splatting. As a ratio it holds for
+# pictures with more or fewer pixels too (`RenderSettings.finer`).
+ASIDE = 10**0.5
+
 
 def gate(shape: tuple[Tensor, Tensor, Tensor, Tensor], opacities: Tensor, settings: RenderSettings) -> Tensor:
     """1 where a splat is drawn and 0 where it is culled, [N], with the gradient of the smooth step.
@@ -53,14 +57,14 @@ def stretched(
     """Stretch the `drawn` [N] splats whose `spread` is below `least` px² until it is `least`.
 
     As in GaussianSplats3D (SplatMaterial3D): the direction of the longer axis is (xy, mean + least - xx), which is an eigenvector
-    only where the variances do not change. A round splat becomes elongated along y. vk_gaussian_splatting (threedgs) has 1 in place of an
-    xy between ±`level`.
+    only where the variances do not change. A round splat becomes elongated along y. vk_gaussian_splatting (threedgs) has `ASIDE` · `least` in
+    place of an xy between ±`level`.
     """
     xx, xy, yy, _ = shape
     mean, half = (xx + yy) / 2, (xx - yy) / 2
     changed = drawn & (spread(shape) < least)
     # `where` before the squares as well as after: those of the others may overflow, and infinity times zero is NaN.
-    up, xy = torch.where(changed, least - half, 1.0), torch.where(changed, torch.where(xy.abs() < level, 1.0, xy), 0.0)
+    up, xy = torch.where(changed, least - half, 1.0), torch.where(changed, torch.where(xy.abs() < level, ASIDE * least, xy), 0.0)
     squared = xy.square() + up.square()
     cos, sin = least * (xy.square() - up.square()) / squared, least * 2 * xy * up / squared
     stretch = mean + cos, sin, mean - cos, mean.square() - least**2

@@ -59,9 +59,9 @@ def _own_pages_only() -> Iterator[None]:
 
 
 def foreign_page(headers: Mapping[str, str]) -> bool:
-    """Whether a browser asks for a connection on behalf of another page. Only browsers name one, and a proxy may name the host it was asked for."""
+    """Whether a browser asks for a connection on behalf of another page. Only browsers name one, and proxies may name the hosts asked for."""
     page = headers.get("Origin")
-    hosts = (headers.get("Host"), headers.get("X-Forwarded-Host"))
+    hosts = [host for name in ("Host", "X-Forwarded-Host") for each in headers.get(name, "").split(",") if (host := each.strip())]
     return page is not None and headers.get("Upgrade") is not None and page.partition("://")[2] not in hosts
 
 

@@ -14,7 +14,6 @@ from torch import Tensor
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.formats.images import image_size
 from mipmap_plugin.models.base import Placed, SplatModel
 from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.scenes import Scene
@@ -35,9 +34,9 @@ class Photographs:
         if not self._originals:
             raise SettingsError(f"{scene.source}: there are no training images to adapt to; leave them out, or give the folder that has them")
         self.cameras = list(self._originals)
-        view, file = self.cameras[0], scene.images[self._originals[self.cameras[0]]]
-        if (size := image_size(file))[0] < (1 - SHAPE_TOLERANCE) * view.width:
-            small = f"{file} has {size[0]} x {size[1]} px, but the base was trained at {view.width} x {view.height} px"
+        view, original = next(iter(self._originals.items()))
+        if (size := scene.image_size(original))[0] < (1 - SHAPE_TOLERANCE) * view.width:
+            small = f"{scene.images[original]} has {size[0]} x {size[1]} px, but the base was trained at {view.width} x {view.height} px"
             raise SettingsError(f"{small}: made larger, it shows less than the base; give larger photographs, or leave them out")
 
     def note(self, views: Sequence[Camera]) -> str:

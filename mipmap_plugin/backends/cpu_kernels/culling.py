@@ -11,7 +11,7 @@ import math
 from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.lanes import both, maximum, minimum, narrow, select, sqrt, wide
 from mipmap_plugin.backends.cpu_kernels.powers import exp2, log2
-from mipmap_plugin.splatting.culls import STEEPNESS
+from mipmap_plugin.splatting.culls import ASIDE, STEEPNESS
 
 LOG2E = 1 / math.log(2)
 
@@ -85,7 +85,7 @@ def stretched(view, shape, drawn):
     xx, xy, yy, det = shape
     least_spread, mean, half = view.least_spread, 0.5 * (xx + yy), 0.5 * (xx - yy)
     changed = both(drawn, half * half + xy * xy < least_spread * least_spread)
-    up, aside = least_spread - half, select(maximum(xy, 0 - xy) < view.level_below, 1.0, xy)
+    up, aside = least_spread - half, select(maximum(xy, 0 - xy) < view.level_below, ASIDE * least_spread, xy)
     per_squared = least_spread / select(changed, aside * aside + up * up, 1.0)
     cos, sin = (aside * aside - up * up) * per_squared, 2 * aside * up * per_squared
     new = mean * mean - least_spread * least_spread
@@ -99,7 +99,7 @@ def grad_stretched(view, shape, changed, d_shape):
     d_xx, d_xy, d_yy, d_det = d_shape
     least_spread, mean, up = view.least_spread, 0.5 * (xx + yy), view.least_spread - 0.5 * (xx - yy)
     level = maximum(xy, 0 - xy) < view.level_below
-    aside = select(level, 1.0, xy)
+    aside = select(level, ASIDE * least_spread, xy)
     per_squared = 1 / select(changed, aside * aside + up * up, 1.0)
     cos, sin = (aside * aside - up * up) * per_squared, 2 * aside * up * per_squared
     d_mean = d_xx + d_yy + 2 * mean * d_det

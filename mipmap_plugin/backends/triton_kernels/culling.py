@@ -16,7 +16,7 @@ MIN_VARIANCE, MIN_CONTRIBUTION, LEAST_SPREAD, MAX_VARIANCE = views.MIN_VARIANCE,
 LEVEL_BELOW = views.LEVEL_BELOW
 BOXED, ROOTED = views.BOXED, views.ROOTED
 
-STEEPNESS = tl.constexpr(culls.STEEPNESS)
+STEEPNESS, ASIDE = tl.constexpr(culls.STEEPNESS), tl.constexpr(culls.ASIDE)
 
 # Outside these ratios of measure and threshold the slope of the gate is 0 to within 1e-10.
 MIN_RATIO, MAX_RATIO = tl.constexpr(1e-3), tl.constexpr(1e3)
@@ -78,7 +78,7 @@ def turned(view, xx, xy, yy, drawn):
     """Which drawn splats have a spread below the least; the vector (aside, up), the cosine and sine of twice its angle, and 1 / its square."""
     least, spread = tl.load(view + LEAST_SPREAD), spread_of(xx, xy, yy)
     changed = drawn & (spread < least)
-    aside, up = tl.where(tl.abs(xy) < tl.load(view + LEVEL_BELOW), 1.0, xy), least - 0.5 * (xx - yy)
+    aside, up = tl.where(tl.abs(xy) < tl.load(view + LEVEL_BELOW), ASIDE * least, xy), least - 0.5 * (xx - yy)
     per_squared = 1 / tl.where(changed, aside * aside + up * up, 1.0)
     return changed, aside, up, (aside * aside - up * up) * per_squared, 2 * aside * up * per_squared, per_squared
 
