@@ -14,6 +14,7 @@ import pressing
 import pytest
 import tiny
 
+from mipmap_plugin.adaptation.optimization.interrupt import interruptible
 from mipmap_plugin.cli import main
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job
@@ -101,6 +102,21 @@ def test_ctrl_c_twice_in_a_second_does_not_break_off_what_the_first_one_removes(
             removed.append(True)
             signal.raise_signal(signal.SIGINT)
     assert removed and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_twice_around_the_last_step_does_not_break_off_what_follows():
+    """The first is heard by the run, the second by the command."""
+    removed = []
+    with pytest.raises(KeyboardInterrupt, match="at step 3"), ends_as_by_ctrl_c():
+        try:
+            with interruptible() as interrupted:
+                signal.raise_signal(signal.SIGINT)
+                assert interrupted()
+                raise KeyboardInterrupt("at step 3")
+        finally:
+            signal.raise_signal(signal.SIGINT)
+            removed.append(True)
+    assert removed
 
 
 def test_ctrl_c_is_heard_where_the_first_was_lost():
