@@ -127,10 +127,14 @@ def test_ctrl_c_is_heard_where_the_first_was_lost():
         pytest.fail("it went on")
 
 
-@pytest.mark.parametrize(("when", "code", "err"), [("import tyro", 130, "mipmap-plugin: interrupted\n"), ("atexit", 0, "")])
+@pytest.mark.parametrize(
+    ("when", "code", "err"),
+    [("import tyro", 130, "mipmap-plugin: interrupted\n"), ("atexit", 0, ""), ("both", 130, "mipmap-plugin: interrupted\n")],
+)
 def test_ctrl_c_before_and_after_a_command_is_no_traceback(when, code, err):
     press = "lambda *_: signal.raise_signal(signal.SIGINT)"
     lines = {"import tyro": f"sys.meta_path.insert(0, types.SimpleNamespace(find_spec={press}))", "atexit": f"atexit.register({press})"}
+    lines["both"] = "\n".join(lines.values())
     script = f"import atexit, signal, sys, types; sys.argv[1:] = ['--version']; import mipmap_plugin.__main__ as ours\n{lines[when]}\n"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     ended = subprocess.run([sys.executable, "-c", script + "sys.exit(ours.run())"], env=environment, capture_output=True, text=True)
