@@ -8,11 +8,12 @@ def run() -> int:
     """Run the command of this process, and return the exit code."""
     try:
         from mipmap_plugin.cli import main  # which takes a moment, in which Ctrl-C may be pressed
-    except KeyboardInterrupt:
+
+        return main()
+    except KeyboardInterrupt:  # before the command began, or after it ended
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         sys.stderr.write("mipmap-plugin: interrupted\n")
         return 130
-    try:
-        return main()
     finally:  # Ctrl-C would only break off what removes temporary files, and Python would tell of that
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 

@@ -57,8 +57,11 @@ def _is_of(frame: FrameType, thing: Any) -> bool:
 
 @contextmanager
 def unchanged(what: str, tensors: Mapping[str, Tensor]) -> Iterator[None]:
-    """Raise PluginError if third-party code changes one of the tensors, by name, in place: they may be the base's own."""
-    before = {name: tensor._version for name, tensor in tensors.items()}
+    """Raise PluginError if third-party code changes one of the tensors, by name, in place: they may be the base's own.
+
+    Tensors that were made in torch's inference mode have no versions, and are not watched.
+    """
+    before = {name: tensor._version for name, tensor in tensors.items() if not tensor.is_inference()}
     yield
-    if changed := [name for name, tensor in tensors.items() if tensor._version != before[name]]:
+    if changed := [name for name in before if tensors[name]._version != before[name]]:
         raise PluginError(f"{what} changed its input in place ({', '.join(changed)}), which may be the base itself; let it work on a copy")

@@ -58,12 +58,12 @@ class Registry:
         target = self._targets[name] if name in self._targets else self._installed()[name]
         return load_target(name, target) if isinstance(target, str) else target
 
-    def packages(self) -> dict[str, str]:
-        """The targets of installed packages by name, with the package: "package.module:Name of my-package 1.0", and with others of that name."""
+    def packages(self) -> dict[str, list[str]]:
+        """The targets of installed packages by name, with the package: "package.module:Name of my-package 1.0"; of each name the first is used."""
         found: dict[str, list[str]] = {}
         for point in entry_points(group=self.group):
             found.setdefault(point.name, []).append(f"{point.value}{_package(point)}")
-        return {name: "; not used, as the name is the same: ".join(dict.fromkeys(places)) for name, places in found.items()}
+        return {name: list(dict.fromkeys(places)) for name, places in found.items()}
 
     def is_taken(self, name: str) -> bool:
         """Whether what an installed package has under a name is not taken, for it is registered here."""

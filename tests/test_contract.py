@@ -288,6 +288,19 @@ def test_the_suite_sees_models_that_break_a_promise(kind, test):
         getattr(ModelSuite(), test)(wrap_model(kind(tiny.model().parameters()), cameras=tiny.cameras(2)))
 
 
+def test_the_suite_rebuilds_splats_of_covariances_as_adaptation_does():
+    """It hands over quaternions and scales alone."""
+
+    class Wanting(Ellipsoids):
+        def rebuild(self, form):
+            super().rebuild(lambda gaussians: replace(form(gaussians), covariances=form(gaussians).covariances.clone()))
+
+    suite, raw, views = ModelSuite(), tiny.model().parameters(), tiny.cameras(2)
+    suite.test_keeps_what_its_traits_promise(wrap_model(Ellipsoids(raw), cameras=views))
+    with pytest.raises(AttributeError, match="'clone'"):
+        suite.test_keeps_what_its_traits_promise(wrap_model(Wanting(raw), cameras=views))
+
+
 def test_the_suite_wants_a_ply_for_viewers(tmp_path):
     with pytest.raises(PluginError, match="save"):
         ModelSuite().test_writes_a_ply_for_viewers(wrapped(save=save_as_text), tmp_path)

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import weakref
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import nullcontext
 from dataclasses import replace
@@ -19,7 +20,7 @@ from mipmap_plugin.cli import main
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.jobs.base import Base
-from mipmap_plugin.jobs.job import Job
+from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.run import run
 
 pytest.importorskip("distributed")
@@ -210,6 +211,34 @@ def test_ctrl_c_does_not_wait_for_workers_that_are_gone(tmp_path, monkeypatch, l
     with pytest.raises(KeyboardInterrupt):
         outcomes.extend(farm.on_dask(jobs, "tcp://somewhere:8786"))
     assert futures[0].cancelled() and [outcome.status for outcome in outcomes] == ["interrupted"] * (leave == "after")
+
+
+def test_outcomes_that_came_are_not_kept_by_workers(tmp_path, monkeypatch):
+    """Of jobs that are sent they hold the files that were made, which a worker keeps as long as there is a future."""
+    from mipmap_plugin.jobs import farm
+
+    jobs, made, living = [Job(Base(tmp_path / "base"), tmp_path / f"{number}.ply", 0.5) for number in range(6)], [], []
+
+    class Done(Future):  # of the standard library, with what dask's has
+        status = "finished"
+
+    def submit(*_, **__):
+        made.append(weakref.ref(future := Done()))
+        future.set_result(None)
+        living.append(sum(ref() is not None for ref in made))
+        return future
+
+    client = SimpleNamespace(
+        cluster=None, scheduler_info=lambda n_workers: {"workers": {"tcp://a:1": {}}}, wait_for_workers=lambda count: None, run=lambda *_, **__: {},
+        submit=submit,
+    )  # fmt: skip
+    monkeypatch.setattr(farm, "_connected", lambda place: nullcontext(client))
+    monkeypatch.setattr(farm, "Event", lambda *_, **__: SimpleNamespace(name="stop", set=lambda: None))
+    monkeypatch.setattr(farm, "as_completed", as_completed)
+    monkeypatch.setattr(farm, "_sent", lambda jobs, client: ([], [(job, job) for job in jobs]))
+    monkeypatch.setattr(farm, "_outcome", lambda future, job: Outcome(job, "done"))
+    outcomes = list(farm.on_dask(jobs, "tcp://somewhere:8786", send_files=True))
+    assert len(outcomes) == len(living) == 6 and max(living) <= farm.SENT_PER_WORKER
 
 
 @pytest.mark.parametrize("theirs, told", [("0.0.1", "has mipmap-plugin 0.0.1"), (PackageNotFoundError("mipmap-plugin"), "lacks mipmap-plugin")])

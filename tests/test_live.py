@@ -177,7 +177,7 @@ def test_gaussians_are_taken_as_splats_of_3dgs():
         adopted.parameters()["means"].zero_()
     assert given.means.abs().sum() > 0
     with pytest.raises(SettingsError, match="Gaussians with covariances cannot be stored"):
-        adopt(replace(given, covariances=torch.eye(3).expand(len(given), 3, 3)))
+        adopt(replace(given, scales=-given.scales, covariances=torch.eye(3).expand(len(given), 3, 3)))
     with pytest.raises(SettingsError, match="this Gaussians has no splats yet"):
         adopt(given[:0])
 

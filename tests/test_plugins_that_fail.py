@@ -54,6 +54,13 @@ def in_place(rendered, gaussians):
 BRIEF = dict(steps=1, extra_views=2, validation_views=2, merge_to=1.0)
 
 
+def test_a_backend_by_itself_may_draw_in_inference_mode():
+    odd = backend(lambda rendered, _: rendered)
+    with torch.inference_mode():
+        rendered = odd.backend()[0].render(tiny.gaussians(), odd.cameras[0], odd.effects())
+    assert torch.allclose(rendered.image, odd.render(odd.cameras[0]).image, atol=1e-4)
+
+
 @pytest.mark.parametrize(
     ("render", "said"),
     [

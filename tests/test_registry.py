@@ -12,6 +12,7 @@ from mipmap_plugin import registry
 from mipmap_plugin.backends import BACKENDS, choose_backend, device_for, get_backend, register_backend, survey
 from mipmap_plugin.backends.base import API_VERSION, Needs
 from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.commands.list import _facts as facts_of
 from mipmap_plugin.errors import BackendUnavailable, PluginError, SettingsError
 from mipmap_plugin.evaluation.backends import check, listing, listing_table
 from mipmap_plugin.registry import Registry, load_target
@@ -185,7 +186,14 @@ def test_of_two_packages_with_one_name_the_first_is_used_and_the_other_is_told(m
     points = [EntryPoint("ours", f"{__name__}:{kind}", "mipmap_plugin.backends") for kind in ("Fast", "Fussy")]
     monkeypatch.setattr(registry, "entry_points", lambda group: points)
     assert get_backend("ours").name == "fast"
-    assert BACKENDS.packages() == {"ours": f"{__name__}:Fast; not used, as the name is the same: {__name__}:Fussy"}
+    assert BACKENDS.packages() == {"ours": [f"{__name__}:Fast", f"{__name__}:Fussy"]}
+
+
+def test_what_is_wrong_with_the_first_of_two_packages_with_one_name_is_told_of_it(monkeypatch):
+    points = [EntryPoint("ours", f"{__name__}:{kind}", "mipmap_plugin.backends") for kind in ("Crashing", "Fussy")]
+    monkeypatch.setattr(registry, "entry_points", lambda group: points)
+    broken = f"{__name__}:Crashing, not used: backend 'ours' cannot be created: RuntimeError: no driver"
+    assert facts_of("backends")["of packages"] == {"ours": f"{broken}; not used, as the name is the same: {__name__}:Fussy"}
 
 
 def test_targets_are_imported_only_when_used(tmp_path, monkeypatch):

@@ -14,6 +14,7 @@ import pressing
 import pytest
 import tiny
 
+from mipmap_plugin.adaptation.optimization.interrupt import interruptible
 from mipmap_plugin.cli import main
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job
@@ -103,6 +104,21 @@ def test_ctrl_c_twice_in_a_second_does_not_break_off_what_the_first_one_removes(
     assert removed and signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+def test_ctrl_c_twice_around_the_last_step_does_not_break_off_what_follows():
+    """The first is heard by the run, the second by the command."""
+    removed = []
+    with pytest.raises(KeyboardInterrupt, match="at step 3"), ends_as_by_ctrl_c():
+        try:
+            with interruptible() as interrupted:
+                signal.raise_signal(signal.SIGINT)
+                assert interrupted()
+                raise KeyboardInterrupt("at step 3")
+        finally:
+            signal.raise_signal(signal.SIGINT)
+            removed.append(True)
+    assert removed
+
+
 def test_ctrl_c_is_heard_where_the_first_was_lost():
     with pytest.raises(KeyboardInterrupt), ends_as_by_ctrl_c():
         with contextlib.suppress(KeyboardInterrupt):  # as Python does where it imports or finalizes
@@ -111,10 +127,14 @@ def test_ctrl_c_is_heard_where_the_first_was_lost():
         pytest.fail("it went on")
 
 
-@pytest.mark.parametrize(("when", "code", "err"), [("import tyro", 130, "mipmap-plugin: interrupted\n"), ("atexit", 0, "")])
+@pytest.mark.parametrize(
+    ("when", "code", "err"),
+    [("import tyro", 130, "mipmap-plugin: interrupted\n"), ("atexit", 0, ""), ("both", 130, "mipmap-plugin: interrupted\n")],
+)
 def test_ctrl_c_before_and_after_a_command_is_no_traceback(when, code, err):
     press = "lambda *_: signal.raise_signal(signal.SIGINT)"
     lines = {"import tyro": f"sys.meta_path.insert(0, types.SimpleNamespace(find_spec={press}))", "atexit": f"atexit.register({press})"}
+    lines["both"] = "\n".join(lines.values())
     script = f"import atexit, signal, sys, types; sys.argv[1:] = ['--version']; import mipmap_plugin.__main__ as ours\n{lines[when]}\n"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     ended = subprocess.run([sys.executable, "-c", script + "sys.exit(ours.run())"], env=environment, capture_output=True, text=True)

@@ -26,7 +26,7 @@ from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.errors import CheckpointError, JobsFailed, OutputExists, SceneError, SettingsError
+from mipmap_plugin.errors import CheckpointError, JobsFailed, OutputError, OutputExists, SceneError, SettingsError
 from mipmap_plugin.formats.magic import SPLAT_RECORD
 from mipmap_plugin.formats.ply import read_header, read_ply, write_ply
 from mipmap_plugin.formats.ply_rows import PlyRows, concatenate
@@ -876,6 +876,14 @@ def test_no_folder_is_claimed_if_one_cannot_be(job):
     with pytest.raises(SettingsError, match="holds other things"):
         next(adapt_all_in_tiles(jobs, 2))
     assert not work_folder(jobs[0].target).exists()
+
+
+def test_a_disk_that_is_full_before_the_base_is_cut_leaves_no_plan_behind(job, monkeypatch):
+    """Which would refuse other settings, for tiles that are not there."""
+    monkeypatch.setattr(plan, "make_cut", lambda *_: (_ for _ in ()).throw(OutputError("no space left")))
+    with pytest.raises(OutputError, match="no space left"):
+        next(adapt_all_in_tiles([job], 2))
+    assert not work_folder(job.target).exists()
 
 
 # The command

@@ -411,6 +411,7 @@ def test_a_budget_of_nothing_returns_the_start(closed_form, monkeypatch):
 def test_short_runs_are_checked_more_often_and_so_is_the_warm_up(settings, checks):
     config = recipe("default", SCALE, **settings)
     assert [step for step in range(1, config.steps + 1) if loop.is_checked(step, config)] == checks
+    assert [step for step in range(1, config.steps + 1) if loop.checks_until(config, step) > loop.checks_until(config, step - 1)] == checks
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import accumulate, compress
+from itertools import compress
 from pathlib import Path
 from statistics import fmean
 
@@ -66,7 +66,6 @@ class ViewSchedule:
         self._rounds, self._seed, self._steps = Rounds(views, config.seed, spread_out=config.order == "spread"), config.seed, config.steps
         self._max_views, self._warm_up = min(config.views_per_step, len(views)), config.warm_up_steps
         self._gathering = math.ceil(config.gathering * config.steps)  # steps during which new views are introduced
-        self._draws_in_warm_up = [0, *accumulate(self._views_in_step(step) for step in range(self._warm_up))]  # before each of its steps
 
     @property
     def views(self) -> int:
@@ -95,8 +94,12 @@ class ViewSchedule:
     def draws_before(self, step: int) -> int:
         """The number of draws of all earlier steps; that of the warm-up is rounded up to whole steps, so that rounds align with steps."""
         if step < self._warm_up:
-            return self._draws_in_warm_up[max(0, step)]
-        return (math.ceil(self._draws_in_warm_up[-1] / self._max_views) + step - self._warm_up) * self._max_views
+            return self._draws_in_warm_up(step)
+        return (math.ceil(self._draws_in_warm_up(self._warm_up) / self._max_views) + step - self._warm_up) * self._max_views
+
+    def _draws_in_warm_up(self, step: int) -> int:
+        """The number of draws of all earlier steps of the warm-up: from which step on each has a first view, a second one, ..."""
+        return sum(max(0, step - number * self._warm_up // self._max_views) for number in range(self._max_views))
 
     def _introduced(self, step: int) -> int:
         """The number of views introduced up to a step: spread evenly, at least one per step, and no more per step than it uses."""

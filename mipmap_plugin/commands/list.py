@@ -38,7 +38,10 @@ def _facts(kind: str) -> dict[str, Any]:
     """What is known of a kind: names that are built in, and what packages add, with its place and what is wrong with it."""
     with uncollected():  # some import torch
         registry, find = KINDS[kind]()
-    added = {name: f"{place}{_trouble(name, registry, find)}" for name, place in registry.packages().items()}
+    added = {
+        name: "; not used, as the name is the same: ".join([f"{first}{_trouble(name, registry, find)}", *others])
+        for name, (first, *others) in registry.packages().items()
+    }
     built_in = [name for name in registry.names() if registry.is_taken(name)]
     if kind != "families":
         return {"built in": built_in, "of packages": added}

@@ -88,8 +88,9 @@ def tradeoff(
 def _check(model: Wrapped, plan: Plan, scales: Sequence[float]) -> None:
     """Raise the errors of a viewer, of recipes and of settings before any work."""
     model.target(plan.viewer)
-    for name, factor, steps in product(plan.recipes, scales, plan.steps or (None,)):
-        make_config(name, factor, **without_none(seed=plan.seed, steps=steps))
+    seeds = {plan.seed, plan.seed + plan.repeats - 1}
+    for name, factor, steps, seed in product(plan.recipes, scales, plan.steps or (None,), seeds):
+        make_config(name, factor, **without_none(seed=seed, steps=steps))
 
 
 def _print(tradeoffs: Sequence[Tradeoff], page: Path | None, json: bool) -> None:

@@ -18,6 +18,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
+from weakref import WeakSet
 
 import dask
 from distributed import Client, Event, Future, KilledWorker, LocalCluster, as_completed
@@ -65,8 +66,9 @@ def on_dask(jobs: Sequence[Job], place: str, threads: int | None = None, *, send
     Ctrl-C lets every running job save its state, and begins no other. Raises SettingsError for a place where there is no scheduler, or workers that
     lack this package or have another version of it.
     """
-    jobs, stopping, given = longest_first(jobs), threading.Event(), list[Future[Outcome | Delivery]]()
-    with _connected(place) as client, _kept_workers(client, place, lambda: stopping.is_set() and client.cancel(given)):
+    jobs, stopping = longest_first(jobs), threading.Event()
+    given: WeakSet[Future[Outcome | Delivery]] = WeakSet()  # workers keep the outcome, with its files, of each task whose future is kept
+    with _connected(place) as client, _kept_workers(client, place, lambda: stopping.is_set() and client.cancel(list(given))):
         client.wait_for_workers(1)  # which says whether files have to be sent, and whether there are GPUs
         _refuse_other_versions(client, place)
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
@@ -76,14 +78,14 @@ def on_dask(jobs: Sequence[Job], place: str, threads: int | None = None, *, send
         stop = Event(f"stop-{uuid.uuid4().hex}", client=client)
 
         def submit(sent: Any) -> Future[Outcome | Delivery]:
-            given.append(client.submit(_task, sent, share, stop.name, key=f"adapt-{uuid.uuid4().hex}", pure=False, resources=needs))
-            return given[-1]
+            given.add(future := client.submit(_task, sent, share, stop.name, key=f"adapt-{uuid.uuid4().hex}", pure=False, resources=needs))
+            return future
 
         def end() -> None:
             stopping.set()
             stop.set()
             if not client.scheduler_info(n_workers=1)["workers"]:  # who would end them
-                client.cancel(given)
+                client.cancel(list(given))
 
         together = SENT_PER_WORKER * max(1, len(workers)) if send_files else max(1, len(jobs))
         try:

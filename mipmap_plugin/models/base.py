@@ -166,7 +166,7 @@ class Rebuilt(SplatModel, Protocol):
     """
 
     def rebuild(self, form: Callable[[Gaussians], Gaussians]) -> None:
-        """Replace the splats by those that `form` returns for them, which have no covariances if there are fewer. Only called on a copy."""
+        """Replace the splats by those that `form` returns for them, which have quats and scales, but no covariances. Only called on a copy."""
 
 
 class Thinned(SplatModel, Protocol):

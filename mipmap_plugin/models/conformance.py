@@ -16,7 +16,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import OutputError, OutputExists, SettingsError
 from mipmap_plugin.models import contract, detect, load_model
 from mipmap_plugin.models.adapted_name import adapted_name
-from mipmap_plugin.models.base import Filtered, Rebuilt, SplatModel, Thinned, why_no_viewer
+from mipmap_plugin.models.base import Filtered, SplatModel, Thinned, why_no_viewer
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes.orbits import orbit
 from mipmap_plugin.wrap import Wrapped, wrap_model
@@ -100,9 +100,8 @@ class ModelSuite:
         models = [cast(Filtered, base.model).fused()] if traits.filtered else []
         models += [VanillaModel(base.model.parameters(), base.model.trained)] if traits.plain else []
         if traits.same_for_all_views:
-            copied = cast(Rebuilt, base.model.copy())
-            copied.rebuild(lambda gaussians: gaussians[torch.arange(len(gaussians))])
-            models.append(copied)
+            models.append(base.model.copy())
+            contract.rebuild(models[-1], lambda gaussians: gaussians[torch.arange(len(gaussians))])
         for model in models:
             _assert_looks_alike(base, base.model, model)
 

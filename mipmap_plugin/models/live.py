@@ -81,7 +81,8 @@ def adopt(model: Any) -> SplatModel:
         inference = any(tensor.is_inference() for tensor in tensors_of(model).values())
         return _checked(model.to(model.parameters()["means"].device) if inference else model)  # no gradient passes such tensors
     if isinstance(model, Gaussians):
-        _refuse_raw(model)
+        if model.covariances is None:  # others are refused below, whatever else they hold
+            _refuse_raw(model)
         splats = replace(model, **_copied(model, {name: tensor for name, tensor in vars(model).items() if tensor is not None}))
         return without_invalid(VanillaModel.from_gaussians(splats).noted("made of Gaussians"))
     parts = [what for name, what in MORE.items() if hasattr(model, name)]

@@ -46,14 +46,14 @@ class Ending:
 
     def __init__(self) -> None:
         self._heard_at = -SAME_S
-        self._presses = Presses()
+        self.presses = Presses()
 
     def pressed(self, number: int, frame: FrameType | None) -> None:
         """Raise KeyboardInterrupt, but not a second time in the middle of what the first one has removed or kept.
 
         The first one may be lost, as where Python imports or finalizes; then the second one has to be heard.
         """
-        if self._presses.is_new() or not isinstance(sys.exc_info()[1], KeyboardInterrupt):
+        if self.presses.is_new() or not isinstance(sys.exc_info()[1], KeyboardInterrupt):
             raise KeyboardInterrupt
 
     def heard(self, number: int, frame: FrameType | None) -> None:
@@ -66,6 +66,12 @@ class Ending:
         if not callable(on_ctrl_c):
             raise KeyboardInterrupt
         on_ctrl_c(signal.SIGINT, frame)
+
+
+def presses() -> Presses:
+    """Those of the command that runs: what one part of it has heard is no new one for the others. Outside of a command, new ones."""
+    ending = getattr(signal.getsignal(signal.SIGINT), "__self__", None)
+    return ending.presses if isinstance(ending, Ending) else Presses()
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from mipmap_plugin.errors import CheckpointError, SettingsError
+from mipmap_plugin.errors import MipmapPluginError, SettingsError
 from mipmap_plugin.formats.atomic import new_file, refuse_output, refuse_unwritable, sha256, write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.splat_transform import is_written
@@ -84,7 +84,7 @@ def cut_for(jobs: Sequence[Job], tiles: int) -> None:
     if not (done := [folder for folder in folders if (folder / CUT).exists()]):
         try:
             make_cut(jobs[0].base.checkpoint, tiles, folders[0])
-        except CheckpointError:
+        except (MipmapPluginError, OSError):  # of the checkpoint, or of a full disk
             for folder in folders:
                 shutil.rmtree(folder)  # nothing was done yet
             raise

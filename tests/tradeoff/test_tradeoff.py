@@ -22,6 +22,7 @@ from mipmap_plugin.evaluation.tradeoff.measuring import OBSERVED_STEPS, RENDERER
 from mipmap_plugin.evaluation.tradeoff.points import Plan
 from mipmap_plugin.evaluation.tradeoff.run import run
 from mipmap_plugin.evaluation.tradeoff.truth import base_itself, photographs
+from mipmap_plugin.limits import MAX_SEED
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.screen_filters import SCREEN_FILTERS
 from mipmap_plugin.wrap import Interrupted, wrap_model
@@ -230,9 +231,9 @@ def test_scale_one_has_nothing_to_trade(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("wrong", [dict(repeats=0), dict(supersampling=(1,))])
+@pytest.mark.parametrize("wrong", [dict(repeats=0), dict(repeats=10**11), dict(supersampling=(1,))])
 def test_a_plan_that_cannot_be_is_refused(wrong):
-    with pytest.raises(SettingsError, match="repeats must be at least 1"):
+    with pytest.raises(SettingsError, match="repeats must be 1 to 1000"):
         Plan(**wrong)
 
 
@@ -290,10 +291,10 @@ def test_a_picture_is_drawn(tmp_path):
 
 def command(tmp_path, *more):
     """The exit code of a small comparison; what `more` has takes the place of its own."""
-    folder, own = tmp_path / "base", {"--steps": "2", "--views": "1"}
+    folder, own = tmp_path / "base", {"--steps": "2", "--views": "1", "--repeats": "1"}
     if not folder.exists():
         tiny.folder(folder, tiny.cameras(3))
-    some = ["--recipe", "default", "--supersampling", "2", "--no-renderers", "--repeats", "1"]
+    some = ["--recipe", "default", "--supersampling", "2", "--no-renderers"]
     some += [word for option in own.items() if option[0] not in more for word in option]
     return cli.main(["tradeoff", str(folder), "--scale", "1/4", "--output", str(tmp_path / "new"), "--no-picture", *some, *more])
 
@@ -309,8 +310,12 @@ def test_the_command_prints_a_table_and_refuses_to_replace_it(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "reason"), [(["--views", "0"], "views: at least 1"), (["--steps", "-1"], "setting steps"), (["--seed", "-1"], "setting seed")]
-)
+    ("wrong", "reason"),
+    [
+        (["--views", "0"], "views: at least 1"), (["--steps", "-1"], "setting steps"), (["--seed", "-1"], "setting seed"),
+        (["--seed", str(MAX_SEED), "--repeats", "2"], "setting seed"),
+    ],
+)  # fmt: skip
 def test_wrong_options_are_refused_before_anything_is_measured(tmp_path, capsys, monkeypatch, wrong, reason):
     monkeypatch.setattr(measuring, "_measured", lambda *_: pytest.fail("it is refused before anything is measured"))
     assert command(tmp_path, *wrong) == 2 and reason in capsys.readouterr().err

@@ -6,7 +6,6 @@ Steps do not all take the same time: in the warm-up they use fewer views, and at
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -77,7 +76,7 @@ class Forecast:
 
     schedule: ViewSchedule
     config: AdaptConfig
-    checks: Sequence[int]  # the steps after which the run is checked, in order
+    checks_until: Callable[[int], int]  # the number of checks up to and after a step
     evaluations: Evaluations  # of the field of a moving scene
     first_step: int = 0  # steps that an earlier process has done
     history: list[tuple[int, float]] = field(default_factory=list)  # draws and seconds of the views alone, before each step of this process
@@ -95,7 +94,7 @@ class Forecast:
         draws, spent = self.history[len(self.history) // 2 - 1] if len(self.history) > 1 else (first, 0.0)
         a_view = (self.history[-1][1] - spent) / (done - draws)
         new_views = max(0, min(self.schedule.views, last) - len(costs.truths))
-        checks = len(self.checks) - bisect_right(self.checks, step)
+        checks = self.checks_until(self.config.steps) - self.checks_until(step)
         motion = self.evaluations.seconds(step, ceiling, last - done, checks)
         return (last - done) * a_view + new_views * _mean(costs.truths.values()) + checks * _mean(costs.checks) + motion
 

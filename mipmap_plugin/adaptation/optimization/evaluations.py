@@ -23,7 +23,8 @@ class Evaluations:
     def __init__(self, follow: Following, config: AdaptConfig, checked: int = 0) -> None:
         """`checked`: the number of views that a check draws."""
         self._follow, self._config, self._checked, self._before = follow, config, checked, follow.seconds
-        factors = [warmed_up(step, config) * decayed(config, step / config.steps) for step in range(config.steps)]
+        steps = range(config.steps if follow.moments else 0)  # of other scenes there is nothing to foretell, and steps may be millions
+        factors = [warmed_up(step, config) * decayed(config, step / config.steps) for step in steps]
         self._factors = torch.tensor(factors, dtype=torch.float64)
         self._squares = 0.0  # px², the sum over all steps so far of their squared rates
 
@@ -36,8 +37,10 @@ class Evaluations:
 
         `ceiling`: of the rates' factor (`Steering`).
         """
+        if not self._follow.moments:
+            return 0.0
         self._squares += (self._config.rates.means * min(float(self._factors[step - 1]), ceiling)) ** 2
-        if not self._follow.moments or step >= self._config.steps:
+        if step >= self._config.steps:
             return 0.0
         return self._follow.evaluation * self._count(step, ceiling, draws + checks * self._checked)
 

@@ -7,21 +7,21 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from mipmap_plugin.process.signals import Presses
+from mipmap_plugin.process.signals import presses
 
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
     """Inside, Ctrl-C is only recorded, and the yielded function returns whether it was pressed since it was last called.
 
-    A second one that is not the same (`Presses`) raises KeyboardInterrupt as soon as Python runs, after a call of a kernel, in the middle of a step:
+    A second one that is not the same (`presses`) raises KeyboardInterrupt as soon as Python runs, after a call of a kernel, in the middle of a step:
     of the run is left what was saved before. One while what the first one asked for is done, such as saving, is only recorded again.
     """
-    presses, pressed = Presses(), False
+    known, pressed = presses(), False
 
     def record(number: int, frame: object) -> None:
         nonlocal pressed
-        if not presses.is_new():
+        if not known.is_new():
             return
         if pressed:
             raise KeyboardInterrupt

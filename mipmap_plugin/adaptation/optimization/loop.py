@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -44,9 +45,8 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     step and after each step; its time is not counted, and the run ends if it returns True.
     """
     order = ViewSchedule(task.views, config)
-    checks = [step for step in range(1, config.steps + 1) if is_checked(step, config)]
     run.costs.motion = lambda: task.follow.seconds
-    forecast = Forecast(order, config, checks, Evaluations(task.follow, config, len(task.validation.steering)), run.step)
+    forecast = Forecast(order, config, partial(checks_until, config), Evaluations(task.follow, config, len(task.validation.steering)), run.step)
     began = run.watch.seconds - run.costs.seconds()
     bar = Bar(total=config.steps, initial=run.step, disable=None, desc=f"adapting {task.part or f'x{task.scale:g}'}", unit="step", bar_format=BAR)
     with bar, ticking(bar), interruptible() as interrupted:
@@ -90,10 +90,24 @@ def _no_time_for_truths(run: Run, config: AdaptConfig, order: ViewSchedule) -> E
 
 def is_checked(step: int, config: AdaptConfig) -> bool:
     """Whether the run is checked after this step: more often during the warm-up, and if the run is short."""
-    warm_up = config.warm_up_steps
-    every = math.ceil(warm_up / CHECKS_IN_WARM_UP) if step < warm_up else max(STEPS_BETWEEN, config.steps // CHECKS)
-    every = min(every, config.check_every)
-    return step % every == 0 or step in (warm_up, config.steps)
+    return step % _steps_between(config, warming_up=step < config.warm_up_steps) == 0 or step in (config.warm_up_steps, config.steps)
+
+
+def checks_until(config: AdaptConfig, step: int) -> int:
+    """The number of checks up to and after this step, by arithmetic: a run that a budget ends may be given millions of steps."""
+    warm_up, last = config.warm_up_steps, config.steps
+    early, late = (_steps_between(config, warming_up=warming_up) for warming_up in (True, False))
+    before = max(0, warm_up - 1)  # the last step of the warm-up that is checked as such
+    count = min(step, before) // early
+    if step >= warm_up:
+        count += step // late - before // late + (warm_up % late > 0)
+    return count + (step >= last != warm_up and last % late > 0)
+
+
+def _steps_between(config: AdaptConfig, *, warming_up: bool) -> int:
+    """The number of steps between two checks."""
+    every = math.ceil(config.warm_up_steps / CHECKS_IN_WARM_UP) if warming_up else max(STEPS_BETWEEN, config.steps // CHECKS)
+    return max(1, min(every, config.check_every))
 
 
 # docs/how_it_works.md shows the code up to the next such line.

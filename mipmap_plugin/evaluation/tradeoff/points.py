@@ -10,6 +10,9 @@ from typing import Any
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.measure import Kind
 
+# Ranges do not change any more long before; a slip of the finger would measure for days, and show nothing.
+MOST_REPEATS = 1000
+
 
 @dataclass(frozen=True)
 class Spread:
@@ -64,5 +67,5 @@ class Plan:
     viewer: str | None = None  # what files are adapted for, and the base is also rendered as
 
     def __post_init__(self) -> None:
-        if self.repeats < 1 or any(n < 2 for n in self.supersampling):
-            raise SettingsError("repeats must be at least 1, and supersampling at least 2")
+        if not 1 <= self.repeats <= MOST_REPEATS or any(n < 2 for n in self.supersampling):
+            raise SettingsError(f"repeats must be 1 to {MOST_REPEATS}, and supersampling at least 2")
