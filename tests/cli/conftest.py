@@ -5,8 +5,6 @@ import tiny
 
 from mipmap_plugin.cli import main
 
-pytest.register_assert_rewrite("commands_run")  # so that a failed check shows what was said
-
 
 @pytest.fixture
 def run(capsys, tmp_path_factory, monkeypatch):
