@@ -12,6 +12,8 @@ from mipmap_plugin.models.families import FAMILIES
 from mipmap_plugin.recipes import RECIPES
 from mipmap_plugin.splatting.viewers import VIEWERS
 
+pytest.register_assert_rewrite("anchor_models", "commands_run")  # their checks show what they found, as those of tests do
+
 SHARED = Path(__file__).parents[1].parent / "shared"
 
 

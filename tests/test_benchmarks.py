@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import tiny
 import torch
-from conftest import SHARED
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 sys.path.append(str(BENCHMARKS))  # its modules import one another by bare names, as scripts do
@@ -79,7 +78,7 @@ def test_users_scenes_are_as_an_adaptation_sees_them(tmp_path, student, pixels):
 
 
 def test_scenes_are_those_that_peers_were_measured_on():
-    file = SHARED / "bench" / "scenes.py"
+    file = BENCHMARKS.parents[1] / "shared" / "bench" / "scenes.py"
     if not file.exists():
         pytest.skip("the peers' generator lies beside the author's repository only")
     spec = importlib.util.spec_from_file_location("peers_scenes", file)

@@ -27,7 +27,7 @@ WRITERS = {
     "splatfacto": lambda path: torch_checkpoints.splatfacto_folder(path, torch_checkpoints.splats()),
 }
 
-# The first needs splat-transform, which is no Python package; tests/test_exchange.py tests it with a stand-in. The second is in tests/test_zipped.py.
+# The first needs splat-transform, which is no Python package; tests/exchange tests it with a stand-in. The second is in tests/test_zipped.py.
 ELSEWHERE = {"exchange", "zipped"}
 
 

@@ -7,7 +7,7 @@ import ply_files
 import pytest
 import torch
 from anchor_checkpoints import STANDARD, VOXEL, Layout
-from test_scaffold import VIEWS, agrees, gain, is_same, refused, state_of
+from anchor_models import VIEWS, agrees, gain, is_same, refused, state_of
 
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.ply import read_ply

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_exchange import RECORD
+from exchange_files import RECORD
 from test_reference import BACKEND, t2_camera, t3_gaussian
 
 from mipmap_plugin.effects import Effects

@@ -1,0 +1,121 @@
+"""Views that show nothing, little or what is too near are refused or told of."""
+
+import re
+from dataclasses import replace
+
+import pytest
+import tiny
+import torch
+from brief_runs import is_finite, shrunk
+
+from mipmap_plugin.adaptation.views import remarks
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.wrap import wrap_model
+
+
+def test_a_bare_file_without_cameras_adapts_on_an_orbit(tmp_path, monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 24)
+    adapted = wrap_model(tiny.ply(tmp_path / "base.ply")).adapt(1 / 4, steps=2, extra_views=3)
+    assert adapted.report.views == "3 views of a generated orbit at 24 px (the checkpoint came without cameras)"
+    assert is_finite(adapted.model)
+
+
+@pytest.mark.parametrize("cameras", ["cameras.json", [3], 7])
+def test_what_are_no_cameras_is_refused(cameras):
+    with pytest.raises(SettingsError, match=r"cameras must be of the type mipmap_plugin.Camera"):
+        wrap_model(tiny.model(), cameras=tiny.cameras(2)).adapt(0.5, cameras=cameras, steps=0)
+    with pytest.raises(SettingsError, match=r"cameras must be of the type mipmap_plugin.Camera"):
+        wrap_model(tiny.model(), cameras=[cameras])
+
+
+def test_cameras_that_show_nothing_are_refused():
+    behind = torch.eye(4)
+    behind[2, 3] = -1000.0  # all splats lie behind it
+    away = replace(tiny.cameras(1)[0], viewmat=behind)
+    with pytest.raises(SettingsError, match="none of the 1 views shows a splat"):
+        wrap_model(tiny.model(), cameras=[away]).adapt(0.5, steps=0, views="given")
+
+
+def test_a_scene_of_which_most_is_before_the_near_plane_is_told_of():
+    """What is left is adapted all the same."""
+    base = wrap_model(tiny.model(), cameras=tiny.cameras())
+    depths = torch.stack([camera.to_camera(base.model.parameters()["means"].detach())[:, 2] for camera in base.cameras])
+    base.trained = replace(base.trained, near_plane=float(depths.median()))  # each splat is far enough in some views
+    with pytest.warns(UserWarning, match=r"(4|5)\d% of the splats in a view's picture lie nearer than .* units, where renderers of 3DGS draw none"):
+        base.adapt(1 / 2, recipe="instant")
+
+
+@pytest.mark.usefixtures("small_orbits")
+def test_without_cameras_the_orbit_is_told_of(recwarn):
+    wrap_model(tiny.model()).adapt(1 / 2, steps=0, extra_views=2, merge_to=1.0)
+    assert [each for each in recwarn if str(each.message).startswith("no cameras are known: views of a generated orbit")]
+    recwarn.clear()
+    wrap_model(tiny.model()).adapt(1 / 2, steps=0, extra_views=2, merge_to=1.0, views="orbit")
+    assert not recwarn
+
+
+@pytest.mark.parametrize("times", [2, 4])
+def test_lenses_that_differ_too_much_are_told_of(times, recwarn):
+    wide, *others = tiny.cameras()
+    wrap_model(tiny.model(), cameras=[wide, *others, replace(wide, fx=times * wide.fx, fy=times * wide.fy)]).adapt(1 / 2, recipe="instant")
+    assert [str(each.message) for each in recwarn if "focal lengths of the cameras are" in str(each.message)] if times > 3 else not recwarn
+
+
+def test_a_scene_nearer_than_the_near_plane_is_refused_with_what_to_do():
+    splats = tiny.gaussians()
+    small = VanillaModel.from_gaussians(replace(splats, means=splats.means * 0.01, scales=splats.scales * 0.01))
+    smaller = torch.diag(torch.tensor([0.01, 0.01, 0.01, 1.0], dtype=torch.float64))
+    views = [view.moved(smaller) for view in tiny.cameras(2)]
+    with pytest.raises(SettingsError, match=r"all splats lie nearer than 0.2 units, .* scale the scene up, with its cameras if it has any"):
+        wrap_model(small, cameras=views).adapt(0.5, steps=0, views="given")
+
+
+def test_a_scene_in_small_units_is_told_of_where_the_near_plane_keeps_an_orbit_away_from_it():
+    base = wrap_model(shrunk(0.02))
+    where = r"the scene is 0.0\d+ units wide, and no view shows it larger than \S+ px: renderers of 3DGS draw nothing nearer than 0.2 units; "
+    where += "scale the scene up, with its cameras if it has any"  # here it has none
+    [remark] = remarks(base.views(), base.model, 0.2, orbit=True)
+    assert re.match(where, remark) and not remarks(base.views(), base.model, 0.2, orbit=False)
+    with pytest.raises(SettingsError, match=r"renderers of 3DGS draw nothing nearer than 0\.2 units"):
+        wrap_model(shrunk(1e-4)).adapt(0.5, recipe="instant")
+    with pytest.raises(SettingsError, match="the cameras seem to be in other units"):
+        far = torch.diag(torch.tensor([100.0, 100.0, 100.0, 1.0], dtype=torch.float64))
+        wrap_model(tiny.model(), cameras=[view.moved(far) for view in tiny.cameras(2)]).adapt(0.5, recipe="instant")
+
+
+@pytest.mark.parametrize("viewer", [None, "spark"])  # for which it is converted at x1 before
+def test_a_small_scene_may_be_zoomed_into(viewer):
+    far = torch.diag(torch.tensor([12.0, 12.0, 12.0, 1.0], dtype=torch.float64))
+    base = wrap_model(tiny.model(), cameras=[view.moved(far) for view in tiny.cameras(2)])
+    small = r"no view shows it larger than \d\S* px: the cameras seem to be in other units"
+    for scale in (0.5, 1.1):
+        with pytest.raises(SettingsError, match=small):
+            base.adapt(scale, steps=1, viewer=viewer)
+    with pytest.warns(UserWarning, match=small):
+        assert base.adapt(8, steps=1, viewer=viewer, extra_views=1).report.scale == 8
+
+
+def test_a_model_of_which_nothing_is_drawn_is_refused_and_one_of_which_little_is_is_not():
+    faint = tiny.model()
+    faint.parameters()["opacities"][:] = -8.0
+    base = wrap_model(faint, cameras=tiny.cameras(2))
+    for scale in (0.5, 1):
+        with pytest.raises(SettingsError, match="below 1/255 and are never drawn; the training or the export failed"):
+            base.adapt(scale, steps=0, views="given")
+    faint.parameters()["opacities"][7] = 2.0
+    away = replace(tiny.cameras(1)[0], viewmat=HALF_TURN @ tiny.cameras(1)[0].viewmat)
+    wrap_model(faint, cameras=[away, *tiny.cameras(2)]).adapt(0.5, steps=0, views="given")
+
+
+def test_views_that_show_nothing_do_not_count_in_the_mean():
+    """They are at 120 dB, whatever the others show."""
+    away = [replace(view, viewmat=HALF_TURN @ view.viewmat) for view in tiny.cameras(3)]
+    model = wrap_model(tiny.model(), cameras=[*tiny.cameras(3), *away])
+    alone = wrap_model(tiny.model(), cameras=tiny.cameras(3))
+    settings = dict(steps=1, views_per_step=400, extra_views=0)  # many views for validation
+    both, without = (each.adapt(0.5, **settings).report.psnr_before() for each in (model, alone))
+    assert both == pytest.approx(without, abs=6)
+
+
+HALF_TURN = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))

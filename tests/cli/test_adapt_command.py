@@ -1,0 +1,145 @@
+"""`adapt`: what it writes, and how it goes on after Ctrl-C."""
+
+import gc
+import json
+import re
+import signal
+import weakref
+from pathlib import Path
+
+import pressing
+import pytest
+import tiny
+from commands_run import NO_STEP, QUICK, record_of, refused
+
+from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.formats.tags import provenance_of
+from mipmap_plugin.models import load_model
+from mipmap_plugin.wrap import Wrapped
+
+pytestmark = pytest.mark.usefixtures("few_views")
+
+
+def splats_of(report):
+    """The bytes of the splats of an adapted PLY, whose header has the seconds of the run."""
+    return Path(report["file"]).read_bytes().partition(b"end_header\n")[2]
+
+
+def test_adapt_two_scales_into_a_folder(run, model_folder, tmp_path):
+    words = ["adapt", model_folder, "--scale", "1/4", "--scale", "2", "--output", tmp_path / "out", "--log", tmp_path / "log.txt", *QUICK]
+    code, out, _ = run(*words)
+    assert code == 0
+    what, where = out.splitlines()[::2], out.splitlines()[1::2]
+    for scale, name in [(0.25, "base_x0.25"), (2, "base_x2")]:
+        ply = tmp_path / "out" / name / "point_cloud/iteration_30000/point_cloud.ply"
+        assert provenance_of(read_ply(ply).comments)["scale"] == scale
+        assert json.loads(ply.with_name("point_cloud.ply.adaptation.json").read_text())["scale"] == scale
+        assert where.pop(0).startswith(f"{ply}, made for renderers that draw as 3DGS does")
+        assert re.fullmatch(rf"x{scale:g}: (\S+ -> \S+ dB on views|holds the base as it is, ).*, 60 -> \d+ splats, \d+\.\d s", what.pop(0))
+    log = (tmp_path / "log.txt").read_text()
+    assert "ended by 2 steps" in log and "backend cpu: " in log and "the 4 given views" in log
+    assert not list(tmp_path.rglob("*.resume"))
+
+
+def test_a_file_that_is_written_takes_no_memory_while_the_next_is_made(run, model_folder, tmp_path, monkeypatch):
+    made, left, adapt = [], [], Wrapped.adapt
+
+    def watched(*arguments, **options):
+        gc.collect()
+        left.append([each() for each in made])
+        adapted = adapt(*arguments, **options)
+        made.append(weakref.ref(adapted))
+        return adapted
+
+    monkeypatch.setattr(Wrapped, "adapt", watched)
+    assert run("adapt", model_folder, "--scale", "1/4", "--scale", "1/2", "--output", tmp_path / "out", *NO_STEP)[0] == 0
+    assert left == [[], [None]]
+
+
+@pytest.mark.usefixtures("small_orbits")
+def test_adapt_writes_beside_the_checkpoint_unless_told_otherwise(run, tmp_path):
+    base = tiny.ply(tmp_path / "base.ply")
+    code, out, _ = run("adapt", base, "--scale", "4", *NO_STEP, "--json")
+    assert code == 0
+    [report] = json.loads(out)
+    assert report["file"] == str(tmp_path / "base_x4.ply") and report["settings"]["recipe"] == "default"
+    assert len(load_model(tmp_path / "base_x4.ply")) == 60
+
+
+def test_adapt_hands_its_options_on(run, model_folder, tmp_path):
+    options = ["--recipe", "paper", "--seed", "7", "--resize", "area", "--upsampler", "lanczos", "--background", "white", "--time-budget-s", "60"]
+    code, out, _ = run("adapt", model_folder, "--scale", "1/2", "--output", tmp_path / "a.ply", "--json", *options, *QUICK)
+    assert code == 0
+    settings = json.loads(out)[0]["settings"]
+    assert {name: settings[name] for name in ("recipe", "seed", "resize", "upsampler", "time_budget_s", "steps", "views")} == {
+        "recipe": "paper", "seed": 7, "resize": "area", "upsampler": "lanczos", "time_budget_s": 60, "steps": 2, "views": "given",
+    }  # fmt: skip
+
+
+def test_adapt_takes_cameras_from_elsewhere(run, tmp_path):
+    views = tiny.scene(tmp_path / "scene", train=tiny.cameras(3))
+    answer = run("adapt", tiny.ply(tmp_path / "a.ply"), "--scale", "1/2", "--cameras", views, "--json", *QUICK)
+    assert answer[0] == 0 and "the 5 given views" in json.loads(answer[1])[0]["views"]
+
+
+def test_the_same_scale_twice_is_one_scale(run, model_folder, tmp_path):
+    code, out, _ = run("adapt", model_folder, "--scale", "4", "--scale", "4/1", "--output", tmp_path / "a.ply", *NO_STEP)
+    assert code == 0 and out.count("x4:") == 1
+
+
+@pytest.mark.usefixtures("small_orbits")
+def test_an_output_that_exists_needs_overwrite_and_is_refused_before_any_work(run, tmp_path, monkeypatch):
+    base = tiny.ply(tmp_path / "base.ply")
+    (tmp_path / "base_x4.ply").write_text("precious")
+    with monkeypatch.context() as first:
+        first.setattr("mipmap_plugin.wrap.Wrapped.adapt", lambda *_, **__: pytest.fail("worked in vain"))
+        refused(run("adapt", base, "--scale", "2", "--scale", "4"), "base_x4.ply exists already; pass --overwrite")
+    assert (tmp_path / "base_x4.ply").read_text() == "precious" and not (tmp_path / "base_x2.ply").exists()
+    assert run("adapt", base, "--scale", "4", "--overwrite", *NO_STEP)[0] == 0
+    assert len(load_model(tmp_path / "base_x4.ply")) == 60
+
+
+def test_ctrl_c_ends_with_130_and_the_same_command_goes_on(run, model_folder, tmp_path, monkeypatch):
+    command = ["adapt", model_folder, "--scale", "1/4", *QUICK]
+    run(*command, "--output", tmp_path / "whole.ply")
+    pressing.in_step(monkeypatch, lambda: signal.raise_signal(signal.SIGINT))(1)
+    code, out, err = run(*command, "--output", tmp_path / "new.ply")
+    assert (code, out) == (130, "")
+    assert "interrupted at step 1; run the same command again to continue from" in err and "Traceback" not in err
+    assert (tmp_path / "new.ply.resume").exists() and not (tmp_path / "new.ply").exists()
+    assert run(*command, "--output", tmp_path / "new.ply")[0] == 0
+    assert (tmp_path / "new.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
+    assert not (tmp_path / "new.ply.resume").exists()
+
+
+def test_ctrl_c_between_two_files_and_the_same_command_goes_on(run, model_folder, tmp_path, monkeypatch):
+    """What is finished is not made again; the page says of it what it can."""
+    command = ["adapt", model_folder, "--scale", "1/4", "--scale", "1/2", *QUICK]
+    whole = json.loads(run(*command, "--output", tmp_path / "whole", "--json")[1])
+    pressing.in_step(monkeypatch, lambda: signal.raise_signal(signal.SIGINT))(3)
+    command += ["--output", tmp_path / "new", "--report"]
+    code, _, err = run(*command)
+    assert code == 130 and "run the same command again to continue from" in err
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["base_x0.25", "base_x0.5.resume"]
+    code, out, err = run(*command, "--json")
+    again = json.loads(out)
+    assert (code, err) == (0, "") and [report["scale"] for report in again] == [0.25, 0.5]
+    assert [Path(report["file"]).relative_to(tmp_path / "new") for report in again] == [
+        Path(report["file"]).relative_to(tmp_path / "whole") for report in whole
+    ]
+    assert [splats_of(report) for report in again] == [splats_of(report) for report in whole]
+    record = record_of(tmp_path / "new" / "base_adapted.report.html")
+    assert [report["title"] for report in record["adaptations"]] == ["×1/4", "×1/2"] and [zoom["label"] for zoom in record["zooms"]] == ["×1/2"]
+    assert record["notes"][0] == "×1/4: an earlier command made it, and its pictures are not drawn again"
+
+
+def test_adapt_to_the_bases_own_scale_gives_the_base(run, model_folder, tmp_path):
+    code, out, err = run("adapt", model_folder, "--scale", "1", "--output", tmp_path / "same.ply", "--report")
+    assert (code, err) == (0, "") and out.startswith("x1: holds the base as it is, 60 -> 60 splats, 0.0 s\n")
+    assert read_ply(tmp_path / "same.ply").columns["x"].shape == (60,)
+
+
+def test_ctrl_c_anywhere_else_says_interrupted(run, model_folder, monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.models.load_model", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    code, _, err = run("inspect", model_folder)
+    assert code == 130 and err.strip() == "mipmap-plugin: interrupted"

@@ -1,0 +1,151 @@
+"""One sentence instead of a traceback for everything that is wrong, and the words of the command line."""
+
+import errno
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import tiny
+from commands_run import NO_STEP, QUICK, refused
+
+from mipmap_plugin.commands.types import read_scale
+
+pytestmark = pytest.mark.usefixtures("few_views")
+
+
+def refused_once_named(answer, *words):
+    """As `refused`, after lines on stdout that say what the file is."""
+    code, out, err = answer
+    assert [line.split(":")[0] for line in out.splitlines()] in ([], ["file", "family"])
+    return refused((code, "", err), *words)
+
+
+def test_the_version(run):
+    assert re.fullmatch(r"mipmap-plugin \d+\.\d+\.\d+\S*\n", run("--version")[1])
+
+
+def malformed(folder: Path) -> dict[str, Path]:
+    sound = tiny.ply(folder / "sound.ply").read_bytes()
+    header = sound.index(b"end_header\n") + len(b"end_header\n")
+    contents = {
+        "empty.ply": b"",
+        "text.ply": b"not a splat",
+        "header_only.ply": sound[: header - 20],
+        "cut.ply": sound[:-100],
+        "no_rows.ply": sound[:header],
+        "mesh.ply": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n",
+        "lfs.ply": b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n",
+        "zip.ply": b"PK\x03\x04" + b"\0" * 40,
+        "poison.ply": sound[:header] + b"\xff" * (len(sound) - header),
+    }
+    for name, content in contents.items():
+        (folder / name).write_bytes(content)
+    (folder / "empty_folder").mkdir()
+    return {name: folder / name for name in [*contents, "empty_folder", "absent.ply"]}
+
+
+@pytest.mark.parametrize("command", ["inspect", "adapt"])
+def test_malformed_checkpoints_end_in_one_sentence(run, tmp_path, command):
+    for name, path in malformed(tmp_path).items():
+        words = ["--scale", "4"] if command == "adapt" else []
+        assert name in refused_once_named(run(command, path, *words)), name
+    assert not [path for path in tmp_path.iterdir() if "_x4" in path.name]
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "[1]", '[{"id": 0}]', '{"frames": []}', "\0"])
+def test_malformed_cameras_end_in_one_sentence(run, model_folder, content):
+    (model_folder / "cameras.json").write_text(content)
+    assert "cameras.json" in refused_once_named(run("inspect", model_folder))
+
+
+@pytest.mark.parametrize("content", ["", "{}", '{"frames": []}', '{"frames": [{"file_path": "a"}]}', '{"frames": [{"w": 4, "h": 4}]}'])
+def test_malformed_scenes_end_in_one_sentence(run, model_folder, tmp_path, content):
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene/transforms_test.json").write_text(content)
+    refused(run("evaluate", model_folder, "--images", tmp_path / "scene", "--scale", "1"), "scene")
+
+
+def test_a_damaged_photograph_ends_in_one_sentence(run, model_folder, tmp_path):
+    scene = tiny.scene(tmp_path / "scene")
+    picture = scene / "test/view_0.png"
+    picture.write_bytes(picture.read_bytes()[:200])
+    refused(run("evaluate", model_folder, "--images", scene, "--scale", "1"), "view_0.png")
+
+
+def test_a_damaged_state_ends_in_one_sentence(run, model_folder, tmp_path):
+    (tmp_path / "new.ply.resume").write_bytes(b"PK\x03\x04 not quite")
+    refused(run("adapt", model_folder, "--scale", "1/4", "--output", tmp_path / "new.ply", *QUICK), "not the state of an interrupted run")
+
+
+def test_requests_that_cannot_be_served_end_in_one_sentence(run, model_folder):
+    refused(run("adapt", model_folder, "--scale", "4", "--backend", "gpu"), "there is no backend 'gpu'; choose from", "reference")
+    refused(run("adapt", model_folder, "--scale", "4", "--upsampler", "swin"), "there is no upsampler 'swin'; choose from bicubic, lanczos")
+    refused(run("adapt", model_folder, "--scale", "4", "--steps", "-1"), "setting steps: must be a whole number of at least 0, got -1")
+    refused(run("adapt", model_folder), "--scale is required; give --scale 1/4")
+    refused(run("evaluate", model_folder, "--images", model_folder), "--scale is required; give --scale 1/4")
+    refused(run("adapt", model_folder, "--scale", "4", "--cameras", "nowhere.json"), "nowhere.json: there is no such file")
+
+
+@pytest.mark.usefixtures("small_orbits")
+def test_a_full_disk_ends_in_one_sentence_and_leaves_the_old_file(run, tmp_path, monkeypatch):
+    base, output = tiny.ply(tmp_path / "base.ply"), tmp_path / "new.ply"
+    output.write_text("precious")
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("mipmap_plugin.formats.atomic.os.replace", full)
+    words = ["--output", output, "--overwrite", *NO_STEP]
+    code, out, err = run("adapt", base, "--scale", "4", *words)
+    orbit, said = err.splitlines()
+    assert (code, out) == (2, "") and "generated orbit" in orbit and "new.ply cannot be written: No space left on device" in said
+    assert output.read_text() == "precious" and sorted(path.name for path in tmp_path.iterdir()) == ["base.ply", "new.ply"]
+
+
+@pytest.mark.usefixtures("small_orbits", "brief_ladders")
+def test_levels_without_cameras_are_told_of_once(run, tmp_path):
+    """Each of several levels is adapted to the orbit."""
+    base = tiny.ply(tmp_path / "base.ply")
+    words = ["--viewer", "playcanvas", "--coarsest", "1/2", "--steps", "0", "--backend", "cpu", "--threads", "1"]
+    code, _, err = run("levels", base, *words, "--output", tmp_path / "levels")
+    assert code == 0 and err.count("views of a generated orbit are adapted to") == 1
+    assert err.count("would change levels at the distances of a generated orbit") == 1
+
+
+def test_an_output_below_a_file_ends_in_one_sentence(run, tmp_path):
+    base = tiny.ply(tmp_path / "base.ply")
+    refused(run("adapt", base, "--scale", "4", "--output", base / "new.ply", *NO_STEP), "new.ply")
+
+
+@pytest.mark.parametrize("words", ["", "fly", "adapt", "adapt a.ply --scale 0", "adapt a.ply --scale 1/0", "inspect a --what"])
+def test_words_that_are_not_understood_exit_with_2(run, words):
+    code, _, err = run(*words.split())
+    assert code == 2 and "Traceback" not in err
+
+
+@pytest.mark.parametrize(("text", "scale"), [("1/4", 0.25), ("4", 4.0), ("1e-3", 0.001), ("1 / 4", 0.25), ("×1/4", 0.25), ("0.25x", 0.25)])
+def test_scales_are_fractions_or_numbers(text, scale):
+    assert read_scale(text) == scale
+
+
+@pytest.mark.parametrize("text", ["", "x", "0", "-1/4", "1/0", "inf", "nan", "1e999", "1e308", "1e5", "1e-50", "25%", "1:4", "0,25", "1 4", "×"])
+def test_scales_that_are_no_zoom(text):
+    with pytest.raises(ValueError, match=r"scale must be a number or a fraction from 1e-09 to 10000, such as 1/4, 0\.25 or 4, got "):
+        read_scale(text)
+
+
+def test_the_module_runs():
+    root = Path(__file__).parents[2]
+    done = subprocess.run([sys.executable, "-m", "mipmap_plugin", "--help"], capture_output=True, text=True, cwd=root)
+    assert done.returncode == 0 and done.stderr == ""
+    assert all(command in done.stdout for command in ("inspect", "adapt", "render", "evaluate", "backends", "demo"))
+
+
+@pytest.mark.parametrize("output", [[], ["--output", "~/half.ply"], ["--output=~/half.ply"]])
+def test_a_tilde_is_the_home_folder_where_no_shell_says_so(run, tmp_path, monkeypatch, output):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    tiny.ply(tmp_path / "base.ply")
+    code, out, _ = run("adapt", "~/base.ply", "--scale", "1/2", "--recipe", "instant", *output)
+    assert code == 0 and str(tmp_path / ("half.ply" if output else "base_x0.5.ply")) in out and "~" not in out

@@ -1,0 +1,165 @@
+"""Exchange formats are recognized by their bytes, not names, and go through splat-transform to be read."""
+
+import gzip
+import hashlib
+import json
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+from exchange_files import RECORD, SPZ, sentence, tool_request
+from ply_files import write, write_splats
+
+from mipmap_plugin.errors import CheckpointError, OutputError
+from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.models import detect, load_model
+from mipmap_plugin.models.adapted_name import adapted_name
+
+pytestmark = pytest.mark.usefixtures("few_views")
+
+MADE = [("spz", SPZ), ("spz", gzip.compress(SPZ)), ("ksplat", b"\0\1\0\0" + bytes(6000)), ("splat", RECORD * 3)]
+
+
+@pytest.mark.parametrize(("ending", "content"), MADE, ids=["spz v4", "spz v2", "ksplat", "splat"])
+def test_without_the_tool_a_file_is_recognized_by_its_bytes_and_the_install_command_is_named(tmp_path, ending, content, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    path = tmp_path / f"my scene.{ending}"
+    path.write_bytes(content)
+    assert f"is {ending.upper()}, an exchange format" in sentence(path)
+    assert sentence(path).endswith("run: npm install -g @playcanvas/splat-transform")
+
+
+@pytest.mark.parametrize(("ending", "content"), MADE, ids=["spz v4", "spz v2", "ksplat", "splat"])
+@pytest.mark.parametrize("named", [True, False])
+def test_a_file_is_read_under_the_ending_that_the_tool_knows(tmp_path, tool, ending, content, named):
+    path = tmp_path / (f"my scene.{ending}" if named else "-scene.bin")
+    path.write_bytes(content)
+    model = load_model(path)
+    assert len(model) == 60 and model.family == "3dgs" and "rounds the trained values" in model.notes[0]
+    assert (model.source, model.digest, model.folder) == (path, hashlib.sha256(content).hexdigest(), None)
+    options, source, target, began = tool_request(tool)
+    assert Path(source).is_absolute() and source.endswith(f".{ending}") and bytes.fromhex(began) == content[:32]
+    assert (source == str(path)) == named and not Path(target).exists() and "--quiet" in options
+
+
+def test_what_the_tool_refuses_is_one_sentence(tmp_path, tool):
+    (tmp_path / "a.spz").write_bytes(b"NGSP" + bytes(9))
+    assert "splat-transform does not read it (Invalid header)" in sentence(tmp_path / "a.spz")
+
+
+def test_compressed_ply_is_recognized_by_its_columns(tmp_path, tool):
+    write(tmp_path / "a.ply", {"packed_position": np.zeros(1, np.int32)})
+    assert len(load_model(tmp_path / "a.ply")) == 60
+    assert tool_request(tool)[1].endswith(".compressed.ply")
+
+
+def test_a_plain_ply_with_the_name_of_a_compressed_one_stays_plain(tmp_path):
+    """Its adaptation is not rounded, which would lose some of what the base has."""
+    plain = write_splats(tmp_path / "a.compressed.ply")
+    assert adapted_name(plain, 1 / 4) == "a_x0.25.ply"
+    packed = write(tmp_path / "b.compressed.ply", {"packed_position": np.zeros(1, np.int32)})
+    assert adapted_name(packed, 1 / 4) == "b_x0.25.compressed.ply"
+
+
+def test_a_sog_whose_checksums_are_wrong_is_refused(tmp_path, tool):
+    with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
+        archive.writestr("meta.json", json.dumps({"version": 2, "means": {"files": ["means_l.webp"]}}))
+        archive.writestr("means_l.webp", b"abcd")
+    (tmp_path / "a.sog").write_bytes((tmp_path / "a.sog").read_bytes().replace(b"abcd", b"abce"))
+    with pytest.raises(CheckpointError, match=r"is damaged \(the checksum of means_l.webp is wrong\)"):
+        load_model(tmp_path / "a.sog")
+
+
+@pytest.mark.parametrize("where", ["a.sog", "room", "room/meta.json"])
+def test_sog_as_a_file_and_as_a_folder(tmp_path, tool, where):
+    meta = json.dumps({"version": 2, "means": {"files": ["means_l.webp", "means_u.webp"]}})
+    with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
+        archive.writestr("meta.json", meta)
+        archive.writestr("means_l.webp", "")
+    (tmp_path / "room").mkdir()
+    (tmp_path / "room/meta.json").write_text(meta)
+    assert len(load_model(tmp_path / where)) == 60
+    assert tool_request(tool)[1] == str(tmp_path / ("a.sog" if where == "a.sog" else "room/meta.json"))
+
+
+def test_npx_is_tried_where_the_tool_is_not_on_the_path(tmp_path, tool):
+    """Installed for one project only; nothing is downloaded."""
+    (tool / "splat-transform").rename(tool / "real")
+    (tool / "npx").write_text(f"#!{sys.executable}\nimport os, sys\nassert sys.argv[1:3] == ['--no-install', 'splat-transform']\n"
+        f"sys.exit(0) if sys.argv[3:] == ['--version'] else os.execv('{tool / 'real'}', ['real', *sys.argv[3:]])\n")
+    (tool / "npx").chmod(0o755)
+    (tmp_path / "a.spz").write_bytes(SPZ)
+    assert len(load_model(tmp_path / "a.spz")) == 60
+    (tool / "npx").write_text(f"#!{sys.executable}\nimport sys\nsys.exit(1)\n")
+    assert "npm install" in sentence(tmp_path / "a.spz")
+
+
+def test_certain_opacities_are_finite(tmp_path, tool):
+    columns = read_ply(tool / "answer.ply").columns
+    columns["opacity"][:2] = np.inf, -np.inf
+    write(tool / "answer.ply", columns)
+    (tmp_path / "a.spz").write_bytes(SPZ)
+    logits = load_model(tmp_path / "a.spz").parameters()["opacities"]
+    assert logits.isfinite().all() and logits[0].sigmoid() > 0.99999
+
+
+def test_a_streamed_sog_is_recognized_too(tmp_path):
+    (tmp_path / "lod-meta.json").write_text(json.dumps({"lodLevels": 2, "filenames": ["0_0/meta.json", "1_0/meta.json"]}))
+    assert detect(tmp_path).family == "exchange"
+
+
+def test_other_json_is_no_sog(tmp_path):
+    (tmp_path / "transforms.json").write_text('{"frames": []}')
+    assert "no checkpoint that is known here" in sentence(tmp_path / "transforms.json")
+
+
+def as_splat(columns):
+    """antimatter15's records: position, lengths, RGBA and the quaternion as bytes."""
+    stacked = lambda *names: np.stack([columns[name] for name in names], 1).astype(np.float64)  # noqa: E731
+    quats = stacked("rot_0", "rot_1", "rot_2", "rot_3")
+    rows = np.empty(len(quats), [("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
+    rows["position"], rows["scale"] = stacked("x", "y", "z"), np.exp(stacked("scale_0", "scale_1", "scale_2"))
+    rows["color"][:, :3] = np.clip(255 * (0.5 + 0.28209479177387814 * stacked("f_dc_0", "f_dc_1", "f_dc_2")), 0, 255)
+    rows["color"][:, 3] = 255 / (1 + np.exp(-columns["opacity"].astype(np.float64)))
+    rows["quat"] = np.clip(quats / np.linalg.norm(quats, axis=1, keepdims=True) * 128 + 128, 0, 255)
+    return rows.tobytes()
+
+
+def as_compressed_ply(columns):
+    """SuperSplat's header and layout; the packed words themselves are not looked at."""
+    count = len(columns["x"])
+    bounds = [f"{end}_{what}" for what in ("x", "y", "z", "scale_x", "scale_y", "scale_z") for end in ("min", "max")]
+    packed = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
+    chunks = -(-count // 256)
+    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {chunks}", *(f"property float {name}" for name in bounds)]
+    lines += [f"element vertex {count}", *(f"property uint {name}" for name in packed), "end_header", ""]
+    return "\n".join(lines).encode() + bytes(4 * 12 * chunks + 4 * 4 * count)
+
+
+@pytest.mark.parametrize("kind", ["SPLAT", "compressed PLY"])
+def test_a_real_capture_in_each_format_under_any_name(shared_data, tmp_path, kind):
+    columns = read_ply(shared_data / "checkpoints/yashica-t4/yashica-t4-top8192.ply").columns
+    path = tmp_path / "capture.dat"
+    path.write_bytes({"SPLAT": as_splat, "compressed PLY": as_compressed_ply}[kind](columns))
+    assert detect(path).family == "exchange"
+
+
+def test_streamed_sog_is_read_by_a_splat_transform_that_knows_it(tmp_path, tool):
+    (tmp_path / "lod-meta.json").write_text(json.dumps({"lodLevels": 2, "filenames": ["0_0/meta.json", "1_0/meta.json"], "tree": {}}))
+    assert len(load_model(tmp_path)) == 60
+    assert tool_request(tool)[1] == str(tmp_path / "lod-meta.json")
+    (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\nprint('splat-transform v2.7.1 (b42b60c)', file=sys.stderr)\n")
+    assert sentence(tmp_path).endswith(
+        "lod-meta.json is Streamed SOG: splat-transform 2.7.1 is too old for it, and 3.2 or newer is needed, which needs Node.js 22; "
+        "run: npm install -g @playcanvas/splat-transform@latest"
+    )
+
+
+def test_an_error_of_node_is_told(tmp_path, tool):
+    script = "print('TypeError [ERR_PARSE_ARGS_UNKNOWN_OPTION]: Unknown option', file=sys.stderr)\nprint('failed in 0.006s')\nsys.exit(1)\n"
+    (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\n{script}")
+    with pytest.raises(OutputError, match=r"does not write it \(Unknown option\)"):
+        tiny.model().save(tmp_path / "a.spz", provenance={})

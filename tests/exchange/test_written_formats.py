@@ -1,0 +1,225 @@
+"""What is written in an exchange format, for which viewers, and what it has no place for."""
+
+import gzip
+import json
+import re
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tiny
+from exchange_files import RECORD, SPZ, tool_request
+from ply_files import write
+
+from mipmap_plugin.cli import main
+from mipmap_plugin.errors import OutputError, SettingsError
+from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.formats.splat_transform import refuse_unread
+from mipmap_plugin.levels.tiles import write_tile
+from mipmap_plugin.models import load_model
+from mipmap_plugin.models.surfels import SurfelModel, flat_trained
+from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.wrap import wrap_model
+
+pytestmark = pytest.mark.usefixtures("few_views")
+
+
+def test_adapt_reads_and_writes_spz(tmp_path, tool, capsys):
+    """The result is written beside the input, in the same format."""
+    (tmp_path / "phone.spz").write_bytes(SPZ)
+    assert main(["adapt", str(tmp_path / "phone.spz"), "--scale", "1/4", "--recipe", "instant"]) == 0
+    assert (tmp_path / "phone_x0.25.spz").read_bytes().startswith(b"ply")  # the stand-in's
+    assert tool_request(tool)[1].endswith("plain.ply") and tool_request(tool)[2].endswith("made.spz")
+    assert json.loads((tmp_path / "phone_x0.25.spz.adaptation.json").read_text())["scale"] == 0.25
+    assert {path.name for path in tmp_path.iterdir()} == {"phone.spz", "phone_x0.25.spz", "phone_x0.25.spz.adaptation.json"}
+    assert main(["adapt", str(tmp_path / "phone.spz"), "--scale", "1/4", "--recipe", "instant"]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+
+
+UP_TO_2, NONE = "reads .spz up to version 2, and splat-transform writes 3 at least", "read no .spz"
+WITH_FILTER = "reads PLYs only, with a column filter_3D that .spz has no place for"
+UNREAD = [("gaussian-splats-3d", UP_TO_2), ("mkkellogg", UP_TO_2), ("gsplat-js", NONE), ("drei", NONE), ("mip", WITH_FILTER)]
+
+
+@pytest.mark.parametrize(("viewer", "why"), UNREAD)
+def test_spz_is_not_written_for_a_viewer_that_does_not_read_it(tmp_path, tool, capsys, viewer, why):
+    (tmp_path / "phone.spz").write_bytes(SPZ)
+    words = ["adapt", str(tmp_path / "phone.spz"), "--scale", "1/4", "--recipe", "instant", "--viewer", viewer]
+    assert main(words) == 2
+    assert f"{why}; give a .ply by --output" in capsys.readouterr().err
+    assert main([*words, "--output", str(tmp_path / "phone.ply")]) == 0
+
+
+def test_spz_for_several_viewers_is_written_with_a_warning_of_those_that_do_not_read_it(tmp_path, recwarn):
+    refuse_unread(tmp_path / "a.spz", ["spark", "three"])
+    refuse_unread(tmp_path / "a.ply", ["spark", "gaussian-splats-3d"])
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match=r"GaussianSplats3D .*; antimatter15/splat, .* read no .spz; give a .ply by --output if it is for these too"):
+        refuse_unread(tmp_path / "a.spz", ["spark", "gaussian-splats-3d", "antimatter15"])
+
+
+@pytest.mark.parametrize("ending", [".spz", ".compressed.ply", ".ply"])
+@pytest.mark.parametrize("viewer", [None, "antialiased"])
+def test_splats_that_not_all_viewers_of_a_format_draw_as_trained_are_told_of(tmp_path, tool, ending, viewer, capsys):
+    """Without a viewer they are for renderers of the training; whoever names a viewer knows it."""
+    base, output = tiny.ply(tmp_path / "base.ply"), tmp_path / f"new{ending}"
+    words = ["adapt", str(base), "--scale", "1/2", "--recipe", "instant", "--screen-filter", "antialiased", "--output", str(output)]
+    assert main([*words, *(["--viewer", viewer] if viewer else [])]) == 0
+    told = f"(antialiased, 0.3 px²), which not all viewers of {ending} do"
+    report = json.loads(output.with_name(output.name + ".adaptation.json").read_text())
+    count = int(viewer is None and ending != ".ply")
+    assert capsys.readouterr().err.count(told) == sum(told in note for note in report["notes"]) == count
+
+
+@pytest.mark.parametrize("ending", [".spz", ".compressed.ply"])
+def test_columns_that_a_format_has_no_place_for_are_told_of_and_in_the_report(tmp_path, tool, ending, capsys):
+    """Normals that are not 0 too, which 3DGS does not have."""
+    columns = {**read_ply(tiny.ply(tmp_path / "a.ply")).columns, "confidence": np.ones(60, np.float32), "nx": np.ones(60, np.float32)}
+    write(tmp_path / "b.ply", columns)
+    told = f"the extra columns nx, ny, nz, confidence are dropped, since {ending} has no place for them; a .ply has"
+    assert main(["adapt", str(tmp_path / "b.ply"), "--scale", "1", "--output", str(tmp_path / f"c{ending}")]) == 0
+    assert capsys.readouterr().err.count(told) == 1
+    assert told in json.loads((tmp_path / f"c{ending}.adaptation.json").read_text())["notes"]
+    assert main(["adapt", str(tmp_path / "b.ply"), "--scale", "1", "--output", str(tmp_path / "d.ply")]) == 0
+    assert json.loads((tmp_path / "d.ply.adaptation.json").read_text())["notes"] == []
+
+
+@pytest.mark.parametrize("ending", [".spz", ".compressed.ply", ".ply"])
+def test_bands_that_splat_transform_does_not_write_are_left_out_and_told_of(tmp_path, tool, ending, capsys):
+    base, made = tiny.ply(tmp_path / "a.ply", degree=4), tmp_path / f"b{ending}"
+    assert main(["adapt", str(base), "--scale", "1", "--output", str(made)]) == 0
+    told, count = "SH bands above degree 3 are dropped, which splat-transform does not write; a .ply has them", int(ending != ".ply")
+    assert capsys.readouterr().err.count(told) == json.loads(made.with_name(made.name + ".adaptation.json").read_text())["notes"].count(told) == count
+    written, rest = read_ply(made).columns, [f"f_rest_{number}" for number in range(45 if count else 72)]  # the stand-in writes what it is given
+    assert [name for name in written if name.startswith("f_rest")] == rest
+    own = load_model(base).parameters()["shN"][:, 14, 2].detach()
+    np.testing.assert_array_equal(written["f_rest_44" if count else "f_rest_62"], own)
+
+
+def test_a_format_that_is_only_read_is_saved_as_a_ply(tmp_path, tool):
+    (tmp_path / "phone.splat").write_bytes(RECORD * 3)
+    assert main(["adapt", str(tmp_path / "phone.splat"), "--scale", "1/4", "--recipe", "instant"]) == 0
+    assert len(load_model(tmp_path / "phone_x0.25.ply")) == 60
+
+
+@pytest.mark.parametrize("name", ["out.splat", "out.KSPLAT"])
+def test_no_folder_is_named_as_a_file_of_these_formats_is(tmp_path, name):
+    with pytest.raises(SettingsError, match=r"is not written as K?SPLAT; give a \.ply"):
+        tiny.model().save(tmp_path / name, provenance={})
+
+
+@pytest.mark.parametrize("name", ["out.sog", "out.spz", "out.compressed.ply"])
+def test_any_splats_are_written_so_where_the_name_asks_for_it(tmp_path, tool, name):
+    tiny.model().save(tmp_path / name, provenance={})
+    assert tool_request(tool)[2].endswith(name.partition(".")[2])
+    assert len(read_ply(tmp_path / name).columns["x"]) == 60
+
+
+@pytest.mark.parametrize(
+    ("cards", "options"), [("[0] llvmpipe (LLVM 15)", ["--gpu", "cpu", "--sh-iterations", "1"]), ("[0] Apple M4", ["--gpu", "0"])]
+)
+def test_sog_is_made_by_a_gpu_or_in_one_iteration(tmp_path, tool, cards, options):
+    script = (tool / "splat-transform").read_text()
+    listing = f"import sys\nif sys.argv[1:] == ['--list-gpus']:\n    sys.exit(print({cards!r}))\n"
+    (tool / "splat-transform").write_text(script.replace("import json", f"{listing}import json", 1))
+    tiny.model().save(tmp_path / "out.sog", provenance={})
+    assert tool_request(tool)[0] == ["--quiet", "--overwrite", *options]
+    tiny.model().save(tmp_path / "out.spz", provenance={})
+    assert tool_request(tool)[0] == ["--quiet", "--overwrite", "--gpu", "cpu", "--spz-version", "3"]
+
+
+def test_a_failed_writing_leaves_the_old_file(tmp_path, tool):
+    (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\nprint('no room', file=sys.stderr)\nsys.exit(3)\n")
+    (tmp_path / "out.spz").write_bytes(b"old")
+    with pytest.raises(OutputError, match="no room"):
+        tiny.model().save(tmp_path / "out.spz", provenance={}, overwrite=True)
+    assert (tmp_path / "out.spz").read_bytes() == b"old" and [path.name for path in tmp_path.iterdir()] == ["out.spz"]
+
+
+def test_what_no_viewer_of_it_shows_is_not_written(tmp_path, tool, monkeypatch):
+    flat = SurfelModel(tiny.model().parameters(), flat_trained(tiny.model().trained))
+    with pytest.raises(SettingsError, match=r"the filter of their own project \(surfel, 0.5 px²\); give a .ply or a folder"):
+        flat.save(tmp_path / "out.spz", provenance={})
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(SettingsError, match="npm install"):
+        tiny.model().save(tmp_path / "out.spz", provenance={})
+
+
+def moved_by(offset):
+    splats = tiny.gaussians()
+    return VanillaModel.from_gaussians(replace(splats, means=splats.means + splats.means.new_tensor([0.0, 0.0, offset])))
+
+
+def test_spz_is_not_written_of_splats_that_are_too_far_away_for_it(tmp_path, tool):
+    """Their coordinates would begin anew after 2,048 units, at -2,048."""
+    far = moved_by(-2060.0)
+    refused = r"60 of 60 splats lie 2,048 or more units from the origin .*; remove them, move or shrink the scene, or give a .sog or a .ply"
+    with pytest.raises(SettingsError, match=refused):
+        far.save(tmp_path / "out.spz", provenance={})
+    with pytest.raises(SettingsError, match=refused):  # before any work
+        wrap_model(far, cameras=tiny.cameras(2)).refuse_output(tmp_path / "out.spz", overwrite=False)
+    far.save(tmp_path / "out.ply", provenance={})
+    with pytest.raises(SettingsError, match="move or shrink the scene, or open the level itself"):
+        write_tile(tmp_path / "out.ply", tmp_path / "out.glb")
+    assert not (tmp_path / "out.glb").exists()
+    far.save(tmp_path / "out.compressed.ply", provenance={})
+    moved_by(2000.0).save(tmp_path / "out.spz", provenance={})
+
+
+def test_levels_in_tiles_are_refused_of_such_splats_before_any_work(tmp_path, tool, capsys, monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.levels.ladder.make_levels", None)
+    moved_by(5e5).save(tmp_path / "city.ply", provenance={})
+    assert main(["levels", str(tmp_path / "city.ply"), "--viewer", "cesium", "--output", str(tmp_path / "ladder"), "--tiles"]) == 2
+    assert "60 of 60 splats lie 2,048 or more units" in (told := capsys.readouterr().err) and "leave --tiles out" in told
+
+
+def test_a_splat_transform_that_is_too_old_for_sog_is_found_before_the_work(tmp_path, tool):
+    (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\nprint('splat-transform v2.7.1 (b42b60c)', file=sys.stderr)\n")
+    with pytest.raises(SettingsError, match=r"splat-transform 2.7.1 is too old for it, and 3.0 or newer is needed"):
+        tiny.model().refuse_output(tmp_path / "a.sog", overwrite=False, networks_move=False)
+    tiny.model().refuse_output(tmp_path / "a.spz", overwrite=False, networks_move=False)
+    (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\nprint('splat-transform v2.0.6', file=sys.stderr)\n")
+    with pytest.raises(SettingsError, match=r"2.0.6 is too old for it, and 2.1 or newer is needed; run: npm install -g \S+; or give a .ply"):
+        tiny.model().refuse_output(tmp_path / "a.spz", overwrite=False, networks_move=False)
+
+
+@pytest.fixture
+def rounding(tool):
+    """The stand-in writes SPZ that it reads as `answer.ply`, another model: as if the format rounded a lot."""
+    script = (tool / "splat-transform").read_text()
+    (tool / "splat-transform").write_text(script + f"pathlib.Path(target).write_bytes({gzip.compress(SPZ)!r}) if target.endswith('.spz') else None\n")
+    tiny.model(seed=5).save(tool / "answer.ply", provenance={}, overwrite=True)
+
+
+@pytest.mark.usefixtures("small_orbits", "rounding")
+def test_the_db_of_a_file_are_of_what_its_format_keeps(tmp_path, capsys):
+    words = ["--scale", "1/4", "--steps", "0", "--viewer", "classic"]
+    source = tiny.ply(tmp_path / "scan.ply")
+    assert main(["adapt", str(source), *words, "--output", str(tmp_path / "scan.spz"), "--report"]) == 0
+    said = capsys.readouterr()
+    report = json.loads((tmp_path / "scan.spz.adaptation.json").read_text())
+    exact = next(psnr for state, psnr in report["validation"].items() if report["returned"].startswith(state))
+    assert report["written"] < exact - 1
+    assert f"-> {report['written']:.2f} dB on views" in said.out
+    page = (tmp_path / "scan.spz.report.html").read_text()
+    record = json.loads(re.search(r'<script type="application/json" id="record">(.*?)</script>', page, re.DOTALL)[1])
+    [picture] = [picture for picture in record["zooms"][0]["pictures"] if picture["role"] == "adapted"]
+    assert picture["mean"] == {"psnr_db": report["written"]} and picture["view"]["psnr_db"] < exact - 1
+    assert f"→ {report['written']:.1f} dB on views" in record["lead"] and record["adaptations"][0]["written"] == report["written"]
+    assert "its format rounds splats, which costs" in said.err and any("its format rounds splats" in note for note in report["notes"])
+
+
+@pytest.mark.usefixtures("small_orbits", "rounding")
+def test_the_db_in_each_of_several_viewers_are_of_what_a_format_keeps(tmp_path):
+    adapted = wrap_model(tiny.ply(tmp_path / "scan.ply")).adapt(1 / 4, steps=0, merge_to=1.0, viewer="portable")
+    exact, files = adapted.report.viewers, [adapted.save(tmp_path / f"a.{suffix}") for suffix in ("ply", "spz")]
+    ply, spz = (json.loads(file.with_name(f"{file.name}.adaptation.json").read_text())["viewers"] for file in files)
+    assert ply == exact and spz.keys() == exact.keys() and spz["classic"] < exact["classic"] - 1
+
+
+@pytest.mark.usefixtures("small_orbits")
+def test_a_ply_is_not_measured_again(tmp_path, capsys):
+    words = ["--scale", "1/4", "--steps", "0"]
+    assert main(["adapt", str(tiny.ply(tmp_path / "scan.ply")), *words, "--output", str(tmp_path / "out.ply")]) == 0
+    assert json.loads((tmp_path / "out.ply.adaptation.json").read_text())["written"] is None

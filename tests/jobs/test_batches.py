@@ -1,0 +1,188 @@
+"""Many checkpoints at many scales by one command: what is skipped, what fails alone, and the lists of them."""
+
+import json
+from pathlib import Path
+
+import pytest
+import tiny
+from small_jobs import QUICK, job_of
+
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.jobs.job import Outcome
+from mipmap_plugin.jobs.listing import find_checkpoints, read_list, shard, without_outputs
+from mipmap_plugin.jobs.run import run as run_job
+from mipmap_plugin.scenes import write_cameras
+from mipmap_plugin.wrap import Wrapped
+
+NO_STEP = ["--views", "given", "--steps", "0"]
+
+
+# The command
+
+
+def test_a_broken_scene_does_not_stop_the_others(run, scenes):
+    (scenes / "broken.ply").write_text("no splats")
+    code, out, err = run("adapt", scenes / "broken.ply", scenes / "chair", scenes / "lego", "--scale", "1/2", "--scale", "4", *NO_STEP)
+    assert code == 2 and "2 of 6 jobs failed" in err
+    assert "6 jobs: 2 failed, 4 done" in out and "broken.ply" in out
+    assert {path.name for path in scenes.iterdir()} >= {"chair_x0.5", "chair_x4", "lego_x0.5", "lego_x4"}
+
+
+def test_jobs_that_fail_side_by_side_leave_no_empty_folder(run, scenes, tmp_path, monkeypatch):
+    """Each of them removes what it made, but not what the other one had made before."""
+
+    def failing(many, jobs, threads):
+        jobs[0].target.parent.mkdir(parents=True)
+        yield from (Outcome(job, "failed", reason="the disk is full") for job in jobs)
+
+    monkeypatch.setattr("mipmap_plugin.commands.many.engine", failing)
+    assert run("adapt", scenes / "lego", scenes / "chair", "--scale", "1/2", "--output", tmp_path / "new" / "out")[0] == 2
+    assert not (tmp_path / "new").exists()
+
+
+def test_no_job_replaces_the_base_of_another(run, tmp_path):
+    for seed, name in enumerate(("a.ply", "a_x0.5.ply")):
+        tiny.ply(tmp_path / name, seed=seed)
+    before = (tmp_path / "a_x0.5.ply").read_bytes()
+    code, _, err = run("adapt", tmp_path / "a.ply", tmp_path / "a_x0.5.ply", "--scale", "1/2", "--overwrite", *NO_STEP)
+    assert code == 2 and "a_x0.5.ply holds a checkpoint that is to be adapted too" in err
+    assert (tmp_path / "a_x0.5.ply").read_bytes() == before
+
+
+def test_this_folder_is_a_checkpoint_too(run, scenes, monkeypatch):
+    monkeypatch.chdir(scenes / "lego")
+    code, out, _ = run("adapt", ".", "../chair", "--scale", "1/2", *NO_STEP)
+    assert code == 0 and "2 done" in out and (scenes / "lego_x0.5").is_dir()
+
+
+def test_two_scales_of_one_name_are_refused(run, scenes):
+    code, _, err = run("adapt", scenes / "lego", "--scale", "1/3", "--scale", "0.3333333", *NO_STEP)
+    assert code == 2 and "would both be written to" in err and not (scenes / "lego_x0.333333").exists()
+
+
+def test_json_says_what_failed_and_why(run, scenes):
+    code, out, _ = run("adapt", scenes / "nowhere", scenes / "lego", "--scale", "4", "--json", *NO_STEP)
+    wrong, right = json.loads(out)
+    assert code == 2
+    assert wrong["outcome"] == "failed" and "nowhere does not exist" in wrong["reason"] and wrong["report"] is None
+    assert right["outcome"] == "done" and right["report"]["scale"] == 4 and Path(right["file"]).is_file()
+
+
+def test_what_is_finished_is_skipped(run, scenes, monkeypatch):
+    command = ["adapt", scenes / "chair", scenes / "lego", "--scale", "1/2", *QUICK]
+    assert run(*command)[0] == 0
+    monkeypatch.setattr(Wrapped, "adapt", lambda *_, **__: pytest.fail("worked in vain"))
+    code, out, _ = run(*command)
+    assert code == 0 and "2 jobs: 2 finished before" in out
+    code, out, _ = run(*command, "--overwrite", "--skip-existing")
+    assert code == 0 and "2 jobs: 2 finished before" in out
+    assert run("adapt", scenes / "chair", "--scale", "1/2", "--skip-existing", *QUICK)[0] == 0
+
+
+def test_other_outputs_are_replaced_only_when_asked(run, scenes):
+    command = ["adapt", str(scenes / "*"), "--scale", "4", *NO_STEP]
+    assert run(*command)[0] == 0
+    code, out, err = run(*command, "--seed", "1")
+    assert code == 2 and "exists already; pass --overwrite" in out and "left out, because an adaptation made them: chair_x4, lego_x4" in err
+    code, out, _ = run(*command, "--seed", "1", "--overwrite")
+    assert code == 0 and "2 jobs: 2 done" in out
+
+
+def test_a_list_file_and_a_folder_for_all(run, scenes, tmp_path):
+    (tmp_path / "scenes.txt").write_text(f"# two scenes\n{scenes / 'chair'}\n\n{scenes}/le*  # a pattern\n")
+    code, out, _ = run("adapt", "--list", tmp_path / "scenes.txt", "--scale", "4", "--output", tmp_path / "new", *NO_STEP)
+    assert code == 0 and "2 jobs: 2 done" in out
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["chair_x4", "lego_x4"]
+
+
+def test_cameras_of_each_scene(run, tmp_path):
+    for name in ("a", "b"):
+        tiny.ply(tmp_path / f"{name}.ply")
+        tiny.scene(tmp_path / "data" / name, train=tiny.cameras(3))
+    code, out, _ = run("adapt", tmp_path / "a.ply", tmp_path / "b.ply", "--scale", "1/2", "--cameras", tmp_path / "data" / "{name}", "--json", *QUICK)
+    assert code == 0 and [each["report"]["views"] for each in json.loads(out)] == ["the 5 given views"] * 2
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        ("--scale 4", "there is no checkpoint to adapt"),
+        ("a.ply b.ply", "give --scale"),
+        ("a.ply b.ply --scale 4 --bytes 2MB", "one checkpoint at a time"),
+        ("a.ply b.ply --scale 4 --report", "one checkpoint at a time"),
+        ("a.ply b.ply --scale 4 --steps -1", "setting steps"),
+        ("a.ply b.ply --scale 4 --viewer nobody", "nobody"),
+        ("a.ply b.ply --scale 4 --backend nobody", "there is no backend 'nobody'"),
+        ("a.ply b.ply --scale 4 --shard 3", "--shard 3: give the part"),
+        ("a.ply b.ply --scale 4 --shard 3/2", "--shard 3/2: there is no such part"),
+        ("a.ply b.ply --scale 4 --jobs 0", "mipmap-plugin: --jobs must be at least 1, got 0\n"),
+        ("a.ply b.ply --scale 4 --threads 0", "mipmap-plugin: --threads must be at least 1, got 0\n"),
+        ("a.ply b.ply --scale 4 --jobs 2 --dask local:2", "leave one of them out"),
+        ("x/a.ply y/a.ply --scale 4 --output new", "would both be written to"),
+        ("*.spz --scale 4", "no file or folder fits this pattern"),
+        ("--list nowhere.txt --scale 4", "nowhere.txt: No such file"),
+    ],
+)
+def test_what_is_wrong_for_all_is_said_before_any_work(run, tmp_path, monkeypatch, words, reason):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run("adapt", *words.split())
+    assert (code, out) == (2, "") and reason in err and err.count("\n") == 1
+
+
+def test_without_words_a_checkpoint_is_asked_for(run):
+    code, _, err = run("adapt")
+    assert code == 2 and "there is no checkpoint to adapt; give a PLY" in err
+
+
+# Lists
+
+
+def test_shards_are_all_jobs_each_once():
+    items = list(range(11))
+    parts = [shard(items, part, 4) for part in range(1, 5)]
+    assert sorted(item for part in parts for item in part) == items and {len(part) for part in parts} == {2, 3}
+    assert shard(items[:2], 4, 4) == []
+    with pytest.raises(SettingsError, match="no such part"):
+        shard(items, 0, 4)
+
+
+def test_a_checkpoint_given_twice_is_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tiny.ply(tmp_path / "a.ply")
+    (tmp_path / "b[1].ply").write_bytes((tmp_path / "a.ply").read_bytes())
+    assert find_checkpoints([Path("a.ply"), tmp_path / "a.ply", Path("*.ply")]) == [Path("a.ply"), Path("b[1].ply")]
+    assert find_checkpoints([Path("b[1].ply")]) == [Path("b[1].ply")]  # a name, though it looks like a pattern
+
+
+def test_a_list_of_cameras_beside_checkpoints_is_left_out_and_told_of(run, tmp_path):
+    tiny.ply(tmp_path / "a.ply")
+    write_cameras(tmp_path / "cameras.json", tiny.cameras(3))
+    words = ["--scale", "1/2", "--output", tmp_path / "out", "--cameras", tmp_path / "cameras.json", *NO_STEP]
+    code, out, err = run("adapt", tmp_path / "*", *words)
+    assert code == 0 and "1 job: 1 done" in out and f"left out, because they list cameras: {tmp_path / 'cameras.json'}" in err
+    assert run("adapt", tmp_path / "cameras.json", "--jobs", "2", *words)[0] == 2
+
+
+def test_a_list_that_is_no_text(tmp_path):
+    (tmp_path / "list").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(SettingsError, match="not a text file"):
+        read_list(tmp_path / "list")
+
+
+def test_files_that_adaptations_leave_are_left_out(tmp_path):
+    job = job_of(tmp_path)
+    run_job(job)
+    (tmp_path / "out.ply.resume").write_bytes(b"")
+    (tmp_path / "ladder").mkdir()
+    (tmp_path / "ladder" / "levels.json").write_text("{}")
+    kept, left_out = without_outputs(sorted(tmp_path.iterdir()))
+    assert kept == [tmp_path / "base.ply", tmp_path / "cameras.json"]
+    assert {path.name for path in left_out} == {"ladder", "out.ply", "out.ply.adaptation.json", "out.ply.resume"}
+
+
+def test_a_list_of_another_editor_is_read_and_an_empty_one_is_named(tmp_path):
+    (tmp_path / "list").write_bytes(b"\xef\xbb\xbfa.ply\r\n")
+    assert read_list(tmp_path / "list") == [Path("a.ply")]
+    (tmp_path / "list").write_text("# nothing yet\n")
+    with pytest.raises(SettingsError, match="list lists no checkpoint"):
+        read_list(tmp_path / "list")

@@ -1,0 +1,173 @@
+"""Ladders: which levels they keep, what is saved of them, and what is said."""
+
+import json
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import anchor_checkpoints
+import moving
+import pytest
+import tiny
+from brief_levels import BRIEF, request, wrapped
+
+from mipmap_plugin import cli, load_model, wrap_model
+from mipmap_plugin.adaptation.report import AS_IT_IS, Report
+from mipmap_plugin.commands.ladders import print_summary
+from mipmap_plugin.errors import OutputExists, SettingsError
+from mipmap_plugin.levels.contents import Contents, LeftOut, Level
+from mipmap_plugin.levels.ladder import MORE_SPLATS, NOT_BETTER, UNSHOWN, _no_use, _shown, make_levels
+from mipmap_plugin.levels.manifest import MANIFEST, base_pixel, write_ladder
+from mipmap_plugin.levels.request import Band
+from mipmap_plugin.models.places import state_path
+from mipmap_plugin.models.vanilla import VanillaModel
+
+pytestmark = pytest.mark.usefixtures("brief_ladders", "few_views")
+
+
+def test_a_level_that_is_the_base_again_is_left_out(tmp_path, monkeypatch, capsys):
+    """The next one is made from the level before, whose splats are fewer or as many."""
+    base, starts = wrapped(), []
+    adapt = base.adapt
+
+    def adapted(scale, **options):
+        starts.append(options.get("start"))
+        made = adapt(scale, **options)
+        held = f"{AS_IT_IS}: 30.00 dB on validation views" if len(starts) == 2 else made.report.returned
+        return replace(made, report=made.report.model_copy(update={"returned": held}))
+
+    monkeypatch.setattr(base, "adapt", adapted)
+    ladder = make_levels(base, request(), resume=tmp_path / "state")
+    assert [level.band.scale for level in ladder.levels] == pytest.approx([1, 1 / 4]) and starts[2].scale == 1
+    assert [(left.scale, left.reason) for left in ladder.contents.left_out] == [(pytest.approx(1 / 2), NOT_BETTER)]
+    manifest = json.loads((ladder.save(tmp_path / "ladder") / MANIFEST).read_text())
+    assert len(manifest["left_out"]) == 1 and 0.24 < manifest["switches"][0]["zoom"] <= 1
+    assert [level["file"] for level in manifest["levels"]] == ["level_0.ply", "level_1.ply"] and not (tmp_path / "ladder/level_2.ply").exists()
+    print_summary(tmp_path, manifest)
+    assert f"no level of its own at x0.5, where a neighbor is shown: {NOT_BETTER}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("returned", "splats", "reason"),
+    [("merged splats", 9, None), ("merged splats", 10, None), ("step 3", 11, MORE_SPLATS), (f"{AS_IT_IS}: 30 dB", 9, NOT_BETTER)],
+)
+def test_a_coarser_level_has_no_more_splats_than_a_finer_one(returned, splats, reason):
+    level = SimpleNamespace(adapted=SimpleNamespace(report=Report.model_construct(returned=returned, validation={})), splats=splats)
+    assert _no_use(level, SimpleNamespace(splats=10)) == reason
+
+
+def test_a_level_that_is_shown_at_no_zoom_is_left_out():
+    """Level 1 is worse than both neighbors, so that each of its switches lies at its own scale."""
+    levels = [Level(SimpleNamespace(number=number, model=tiny.model(3 - number)), Band(0.5**number, 0, 1, 2)) for number in range(3)]
+    dbs = [lambda zoom: 40 + 10 * math.log2(zoom), lambda _: 10, lambda zoom: 30 - 5 * math.log2(zoom / 0.25)]
+    yardstick = SimpleNamespace(psnr=lambda level, zoom: dbs[level.number](zoom), likeness=lambda *_: 30)
+    shown, switches, left_out = _shown(levels, yardstick)
+    assert shown == [levels[0], levels[2]] and len(switches) == 1 and 0.25 < switches[0].zoom < 1
+    assert left_out == [LeftOut(0.5, 2, UNSHOWN)]
+
+
+def test_a_ladder_ends_with_few_enough_splats():
+    ladder = make_levels(wrapped(), request(until_splats=12))
+    assert len(ladder.levels) == 1
+
+
+def test_a_saved_ladder_says_what_it_is(tmp_path):
+    base = wrapped()
+    saved = base.levels("antialiased", coarsest=1 / 2, ratio=2.0, **BRIEF).save(tmp_path / "ladder")
+    manifest = json.loads((saved / MANIFEST).read_text())
+    levels = manifest["levels"]
+    assert [level["scale"] for level in levels] == pytest.approx([1, 1 / 2])
+    for level in levels:
+        model = load_model(saved / level["file"])
+        assert len(model) == level["splats"] and (saved / level["file"]).stat().st_size == level["bytes"] and model.digest == level["sha256"]
+    assert levels[0]["shown_to"] is None and levels[-1]["shown_from"] is None
+    switches = [each["zoom"] for each in manifest["switches"]]
+    assert [level["shown_from"] for level in levels[:-1]] == [level["shown_to"] for level in levels[1:]] == switches
+    assert manifest["worst_db"] == min(point["psnr_db"] for point in manifest["curve"]) and manifest["viewer"] == "antialiased"
+    assert [point["zoom"] for point in manifest["curve"]] == sorted((point["zoom"] for point in manifest["curve"]), reverse=True)
+    with pytest.raises(OutputExists, match="exists already"):
+        write_ladder(Contents(request(), base, [], [], []), saved, overwrite=False)
+    (saved / "notes.txt").write_text("mine")
+    with pytest.raises(OutputExists, match=r"has other things in it, such as notes.txt"):
+        write_ladder(Contents(request(), base, [], [], []), saved, overwrite=True)
+
+
+def test_splats_in_no_picture_have_no_part_in_the_size_of_a_pixel():
+    """More than half of all lie right behind the camera, whose distances would follow from them."""
+    views, ball = tiny.cameras(1), tiny.gaussians(50)
+    behind = tiny.gaussians(60, spread=1e-4, seed=2)
+    eye = views[0].center.float()
+    hidden = replace(behind, means=behind.means + eye + 0.2 * eye / eye.norm())
+    both = ball.joined(hidden)
+    sizes = [base_pixel(wrap_model(VanillaModel.from_gaussians(each), cameras=views)) for each in (ball, both, hidden)]
+    assert sizes[0] == sizes[1] and 0 < sizes[2] < sizes[0] / 5
+
+
+def test_a_ladder_is_saved_when_its_base_is_gone(tmp_path):
+    base = tiny.ply(tmp_path / "base.ply", degree=0)
+    ladder = wrap_model(base, cameras=tiny.cameras(2, width=16, height=12)).levels("classic", coarsest=1.0)
+    base.unlink()
+    assert (ladder.save(tmp_path / "ladder") / MANIFEST).is_file()
+
+
+def test_a_folder_that_is_no_ladder_is_never_replaced(tmp_path, capsys):
+    base = tiny.folder(tmp_path / "base")
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "one.jpg").write_bytes(b"1")
+    for output in (base, tmp_path / "photos"):
+        words = ["levels", str(base), "--viewer", "antialiased", "--output", str(output), "--overwrite"]
+        assert cli.main(words) == 2
+        assert "choose another" in capsys.readouterr().err
+    assert (tmp_path / "photos" / "one.jpg").exists() and (base / "point_cloud").is_dir()
+
+
+def test_levels_for_mip_splatting_start_from_finer_ones_that_are_kept(tmp_path):
+    """Whose files have the column filter_3D, which makes them checkpoints of another family."""
+    ladder = make_levels(wrapped(), request("mip", coarsest=1 / 2, steps=0), resume=tmp_path / "kept")
+    assert [len(level.adapted.model) for level in ladder.levels][1:] and (ladder.save(tmp_path / "ladder") / MANIFEST).is_file()
+
+
+@pytest.mark.parametrize("has_cameras", [True, False])
+def test_levels_of_generated_views_are_said_to_be(tmp_path, capsys, has_cameras):
+    base = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12)) if has_cameras else tiny.ply(tmp_path / "base.ply")
+    words = ["levels", str(base), "--viewer", "classic", "--output", str(tmp_path / "ladder"), "--coarsest", "1"]
+    assert cli.main([*words, "--backend", "cpu", "--threads", "1"]) == 0
+    assert ("no cameras are known" in capsys.readouterr().err) is not has_cameras
+
+
+def test_the_size_of_a_small_level_is_told_in_kilobytes(tmp_path, capsys):
+    base, ladder = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12)), tmp_path / "ladder"
+    words = ["levels", str(base), "--viewer", "classic", "--output", str(ladder), "--coarsest", "1"]
+    assert cli.main([*words, "--backend", "cpu", "--threads", "1"]) == 0
+    size = json.loads((ladder / "levels.json").read_text())["levels"][0]["bytes"]
+    assert f" splats, {size / 1e3:.0f} kB, " in capsys.readouterr().out
+
+
+def test_a_ladder_in_memory_keeps_no_truths():
+    """It is written as PLYs, which round nothing."""
+    assert [level.adapted.judge for level in make_levels(wrapped(), request(coarsest=1.0)).levels] == [None]
+
+
+@pytest.mark.parametrize("write", [anchor_checkpoints.write, moving.write_deformable], ids=["anchors", "moving"])
+@pytest.mark.parametrize("by", ["auto", "zoom", "distance"])
+def test_what_no_viewer_draws_has_no_levels(tmp_path, write, by):
+    write(tmp_path / "base")
+    base = wrap_model(tmp_path / "base", cameras=tiny.cameras(2))
+    with pytest.raises(SettingsError, match="levels are files for viewers, so adapt it to one scale at a time"):
+        make_levels(base, request("supersplat", by=by))
+
+
+def test_the_command_makes_a_ladder_and_prints_it(tmp_path, capsys):
+    base = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12), count=12)
+    options = ["--viewer", "antialiased", "--coarsest", "1/2", "--ratio", "2", "--recipe", "instant", "--views", "given"]
+    words = ["levels", str(base), "--output", str(tmp_path / "ladder"), "--json", *options]
+    assert cli.main(words) == 0
+    manifest = json.loads(capsys.readouterr().out)
+    assert manifest == json.loads((tmp_path / "ladder" / MANIFEST).read_text())
+    print_summary(tmp_path, manifest)
+    said = capsys.readouterr().out
+    print_summary(tmp_path, manifest | {"levels": manifest["levels"][:1]})
+    assert capsys.readouterr().out.startswith(f"{tmp_path}, for antialiased: 1 level\n")
+    assert "2 levels" in said and "level_1.ply  x0.5, shown up to" in said and "at worst" in said
+    assert not state_path(tmp_path / "ladder").exists() and not (tmp_path / "ladder" / "report.html").exists()
+    assert cli.main(words) == 2 and "--overwrite" in capsys.readouterr().err

@@ -1,0 +1,150 @@
+"""transforms files: views, lenses and splits, and a sentence for what is broken."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from scene_files import frame, save_image, write_json
+
+from mipmap_plugin.errors import SceneError
+from mipmap_plugin.scenes import load_scene, read_transforms
+
+
+def test_both_camera_files_of_lego_give_the_same_views(shared_data):
+    base = load_scene(shared_data / "checkpoints/bases/lego_200", {"resolution": -1, "eval": True})
+    photos = load_scene(shared_data / "images/lego")
+    known = {(camera.split, camera.name): camera for camera in base.cameras}
+    assert len(photos.cameras) == 125
+    for camera in photos.cameras:
+        trained = known[camera.split, camera.name]
+        torch.testing.assert_close(camera.viewmat, trained.viewmat, atol=1e-5, rtol=0)
+        resized = camera.resized(200, 200)
+        assert (resized.fx, resized.fy, resized.cx, resized.cy) == pytest.approx((trained.fx, trained.fy, trained.cx, trained.cy), rel=1e-6)
+
+
+def test_the_older_pose_formula_gives_the_same_views_of_lego(shared_data):
+    for file in ("transforms_train.json", "transforms_test.json"):
+        frames = json.loads((shared_data / "images/lego" / file).read_text())["frames"]
+        scene = read_transforms(shared_data / "images/lego" / file)
+        for camera, listed in zip(scene.cameras, frames, strict=True):
+            w2c = np.linalg.inv(np.array(listed["transform_matrix"]))
+            rotation = w2c[:3, :3].T * [1, -1, -1]  # -R with the first column negated, stored transposed
+            older = np.concatenate([rotation.T, -w2c[:3, 3:]], axis=1)
+            torch.testing.assert_close(camera.viewmat[:3], torch.from_numpy(older), atol=1e-5, rtol=0)
+
+
+def test_an_off_center_pose_is_inverted_exactly(tmp_path):
+    save_image(tmp_path / "train/r_0.png")
+    scene = read_transforms(write_json(tmp_path / "transforms_train.json", {"camera_angle_x": 1.0, "frames": [frame()]}))
+    expected = torch.tensor([[1, 0, 0, -1], [0, -1, 0, 2], [0, 0, -1, 3], [0, 0, 0, 1]], dtype=torch.float64)
+    torch.testing.assert_close(scene.cameras[0].viewmat, expected)
+
+
+@pytest.mark.parametrize("listed", ["./train/r_0", "train/r_0.png", "train\\r_0"])
+def test_a_path_may_lack_its_extension(tmp_path, listed):
+    image = save_image(tmp_path / "train/r_0.png")
+    write_json(tmp_path / "transforms_train.json", {"camera_angle_x": 0.8, "frames": [frame(file_path=listed)]})
+    scene = load_scene(tmp_path)
+    (camera,) = scene.cameras
+    assert scene.images[camera].samefile(image)
+    assert (camera.name, camera.width, camera.height) == ("r_0", 8, 6)
+    assert camera.fx == camera.fy == pytest.approx(4 / math.tan(0.4))
+
+
+def test_absent_images_are_counted_and_left_out(tmp_path):
+    save_image(tmp_path / "train/r_0.png")
+    frames = [frame(), frame(file_path="train/r_1"), frame(file_path="train/r_2")]
+    scene = read_transforms(write_json(tmp_path / "transforms_train.json", {"camera_angle_x": 0.8, "frames": frames}))
+    assert len(scene.cameras) == 1
+    assert scene.notes == ["transforms_train.json: 2 listed images are absent; 2 cameras are left out because the file has no w and h"]
+
+
+def test_a_stated_size_makes_views_without_images(tmp_path):
+    scene = read_transforms(write_json(tmp_path / "transforms.json", {"camera_angle_x": 0.8, "w": 40, "h": 30, "frames": [frame()]}))
+    assert (scene.cameras[0].size, scene.images) == ((30, 40), {})
+
+
+def test_without_images_and_size_the_folder_is_refused(tmp_path):
+    with pytest.raises(SceneError, match="none of the listed images is there"):
+        read_transforms(write_json(tmp_path / "transforms_train.json", {"camera_angle_x": 0.8, "frames": [frame()]}))
+
+
+def test_absent_images_whose_cameras_stay_are_counted_alone(tmp_path):
+    data = {"camera_angle_x": 0.8, "w": 40, "h": 30, "frames": [frame()]}
+    assert read_transforms(write_json(tmp_path / "transforms.json", data)).notes == ["transforms.json: 1 listed image is absent"]
+
+
+def test_the_scale_of_a_cameras_axes_is_left_out(tmp_path):
+    """As Blender writes it for a camera that was made smaller; its place is the same."""
+    data = {"camera_angle_x": 0.8, "w": 40, "h": 30}
+    pose = np.array(frame()["transform_matrix"], dtype=np.float64)
+    scaled = pose.copy()
+    scaled[:3, :3] *= 1e-3
+    expected, found = (
+        read_transforms(write_json(tmp_path / f"{name}.json", {**data, "frames": [frame(transform_matrix=matrix.tolist())]})).cameras[0]
+        for name, matrix in {"a": pose, "b": scaled}.items()
+    )
+    torch.testing.assert_close(found.viewmat, expected.viewmat)
+
+
+def test_a_stated_lens_follows_the_size_of_the_image(tmp_path):
+    save_image(tmp_path / "train/r_0.png", 8, 6)
+    lens = {"fl_x": 100.0, "fl_y": 90.0, "cx": 17.0, "cy": 11.0, "w": 32, "h": 24}
+    (camera,) = read_transforms(write_json(tmp_path / "transforms.json", {**lens, "frames": [frame()]})).cameras
+    assert (camera.size, camera.fx, camera.fy, camera.cx, camera.cy) == ((6, 8), 25.0, 22.5, 4.25, 2.75)
+
+
+def test_a_frames_own_lens_wins(tmp_path):
+    data = {"fl_x": 100.0, "w": 32, "h": 24, "frames": [frame(), frame(fl_x=50.0, time=0.25)]}
+    first, second = read_transforms(write_json(tmp_path / "transforms.json", data)).cameras
+    assert (first.fx, second.fx) == (100.0, 50.0)
+    assert (first.time, second.time) == (None, 0.25)
+
+
+def test_test_and_train_files_are_the_splits(tmp_path):
+    for split, names in (("train", "abc"), ("test", "de"), ("val", "f")):
+        frames = [frame(file_path=name) for name in names]
+        write_json(tmp_path / f"transforms_{split}.json", {"fl_x": 9.0, "w": 4, "h": 4, "frames": frames})
+    scene = load_scene(tmp_path)
+    assert [camera.name for camera in scene.split("train")] == ["a", "b", "c"]
+    assert [camera.name for camera in scene.split("test")] == ["d", "e"]
+
+
+def test_without_a_test_file_val_is_the_test_split(tmp_path):
+    for split in ("train", "val"):
+        write_json(tmp_path / f"transforms_{split}.json", {"fl_x": 9.0, "w": 4, "h": 4, "frames": [frame(file_path=split)]})
+    assert [camera.name for camera in load_scene(tmp_path).split("test")] == ["val"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"k1": "x"}, r"frame 0 \(r_0\), k1: is not made of numbers"),
+        ({"camera_model": "EQUIRECTANGULAR"}, r"has a lens that is not perspective \(EQUIRECTANGULAR\)"),
+        ({"camera_model": "EQUIRECTANGULAR", "fl_x": None}, r"has a lens that is not perspective \(EQUIRECTANGULAR\)"),
+        ({"fl_x": None}, "has neither 'fl_x' nor 'camera_angle_x'"),
+        ({"fl_x": None, "camera_angle_x": 40.0}, "give it in radians"),
+        ({"transform_matrix": None}, "has no 'transform_matrix'"),
+        ({"transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0]]}, r"transform_matrix: has shape \[2, 4\]"),
+        ({"transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0]]}, "transform_matrix: is not a rotation"),
+        ({"transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, math.inf]]}, "transform_matrix: holds NaN or infinity"),
+        ({"file_path": None}, "frame 0: has no 'file_path'"),
+    ],
+)
+def test_a_broken_frame_is_named(tmp_path, changes, message):
+    path = write_json(tmp_path / "transforms.json", {"w": 8, "h": 8, "frames": [frame(**{"fl_x": 9.0, **changes})]})
+    with pytest.raises(SceneError, match=message):
+        read_transforms(path)
+
+
+def test_zero_distortion_is_no_distortion(tmp_path):
+    data = {"fl_x": 9.0, "w": 8, "h": 8, "k1": 0.0, "camera_model": "OPENCV", "frames": [frame()]}
+    assert len(read_transforms(write_json(tmp_path / "transforms.json", data)).cameras) == 1
+
+
+@pytest.mark.parametrize(("content", "lacks"), [([], "no list"), ({"frames": []}, "lists no frames"), ({"frames": 3}, "no list"), ({}, "no list")])
+def test_a_file_without_frames_is_named(tmp_path, content, lacks):
+    with pytest.raises(SceneError, match=lacks):
+        read_transforms(write_json(tmp_path / "transforms.json", content))

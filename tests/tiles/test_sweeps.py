@@ -1,0 +1,143 @@
+"""What a run in tiles begins with, and its sweeps: no start is worse than the base, and what does harm is undone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import tiny
+import torch
+from cut_scenes import config, cut_in_three
+
+from mipmap_plugin.adaptation.views import ViewSchedule
+from mipmap_plugin.screen_filters import DILATION
+from mipmap_plugin.tiles import steering
+from mipmap_plugin.tiles.run import adapt_in_tiles
+from mipmap_plugin.tiles.start import StartSearch
+from mipmap_plugin.tiles.steering import Steered, sweep_of
+from mipmap_plugin.tiles.sweeps import Sweep, sweeps, views_of
+
+
+@pytest.mark.parametrize(
+    ("psnrs", "name"),
+    [
+        ((30.0, 20.0, 25.0, 32.0), "the closed form of merged splats"),  # the base, the closed form, what is merged least, and most
+        ((30.0, 31.0, 30.5, 25.0, 26.0), "the closed form of merged splats"),
+        ((30.0, 31.0, 25.0), "the closed form"),  # of which most would lose more
+        ((30.0, 20.0, 25.0, 26.0, 27.0), "the base as it is"),
+    ],
+)
+def test_no_start_is_worse_than_the_base_and_none_is_tried_in_vain(job, monkeypatch, psnrs, name):
+    scene = cut_in_three(job, merge_to=0.5, merging_costs=20.0)
+    measured = iter(psnrs)
+    monkeypatch.setattr("mipmap_plugin.tiles.start.psnr", lambda *_: next(measured))
+    StartSearch(scene).run()
+    assert torch.load(scene.folder / "start.pt")["name"] == name and not list(measured)
+    assert sorted(file.name for file in scene.folder.glob("*.splats")) == ["base.splats", "start_0.splats", "start_1.splats", "start_2.splats"]
+
+
+@pytest.mark.parametrize(("eps2d", "name"), [(0.1, "the closed form of merged splats"), (DILATION, "the closed form")])
+def test_the_mildest_merging_may_cost_more_before_steps_for_another_renderer(job, monkeypatch, eps2d, name):
+    scene = cut_in_three(job, merge_to=0.5)
+    scene.target = replace(scene.target, eps2d=eps2d)
+    measured = iter((20.0, 30.0, 29.5, *((29.5, 29.5) if eps2d < DILATION else ())))  # the base, the closed form, what is merged least, and more
+    monkeypatch.setattr("mipmap_plugin.tiles.start.psnr", lambda *_: next(measured))
+    monkeypatch.setattr("mipmap_plugin.tiles.start.draws_alike", lambda *_: False)
+    StartSearch(scene).run()
+    assert torch.load(scene.folder / "start.pt")["name"] == name and not list(measured)
+
+
+def test_without_a_closed_form_merged_splats_keep_their_opacities(job, monkeypatch):
+    """As without tiles, where they are matched in the closed form."""
+    scene = cut_in_three(job, merge_to=0.5, closed_form=False)
+    monkeypatch.setattr(StartSearch, "_match", None)
+    monkeypatch.setattr("mipmap_plugin.tiles.start.psnr", lambda scene, splats, *_: -float(len(splats)))
+    StartSearch(scene).run()
+    assert torch.load(scene.folder / "start.pt")["name"] == "merged splats"
+
+
+def test_a_run_is_cut_into_a_warm_up_and_sweeps():
+    found = sweeps(config(steps=600))
+    assert [(sweep.first, sweep.end) for sweep in found] == [(0, 60), (60, 330), (330, 600)]
+    assert found[0].checks == (10, 20, 30, 40, 50, 60) and found[1].checks == (195, 330)
+    assert [sweep.checks for sweep in sweeps(config(steps=4))] == [(1,), (2, 4)]
+    assert sweeps(config(steps=0)) == []
+    assert [sweep.end for sweep in sweeps(config(steps=30, warm_up=0.0))] == [15, 30]
+
+
+def test_only_views_that_steps_use_are_drawn():
+    views = tiny.cameras(40)
+    settings = config(steps=12)
+    first, both = views_of(views, settings, 0, 6), views_of(views, settings, 0, 12)
+    schedule = ViewSchedule(views, settings)
+    assert set(first) == {view for step in range(6) for view in schedule(step, step / 12)}
+    assert len(first) < len(both) < 40
+    assert views_of(views, config(steps=12, time_budget_s=1.0), 0, 6) == views
+
+
+@pytest.mark.parametrize(
+    ("psnrs", "kept", "ceiling"),
+    [((31.0, 32.0), 2, 1.0), ((31.0, 30.95), 2, 1.0), ((31.0, 30.0), 1, 0.5), ((29.0,), 0, 0.5)],
+)
+def test_what_does_harm_to_the_whole_is_undone(halved, monkeypatch, psnrs, kept, ceiling):
+    torch.save({"name": "the start", "psnr": 30.0}, halved.folder / "start.pt")
+    measured = iter(psnrs)
+    monkeypatch.setattr(steering, "psnr", lambda *_: next(measured))
+    monkeypatch.setattr(steering, "open_state", lambda *_: None)
+    monkeypatch.setattr(steering, "rate_factor", lambda *_: 1.0)
+    steering.steer(halved, Sweep(0, 0, (1, 2), 0, 0))
+    after = Steered.before(halved.folder, 1)
+    assert (max(after.step, 0), after.ceiling, tuple(after.psnrs)) == (kept, ceiling, psnrs)
+
+
+def test_a_little_loss_in_the_warm_up_is_no_harm_and_it_is_not_repeated(halved, monkeypatch):
+    torch.save({"name": "the start", "psnr": 30.0}, halved.folder / "start.pt")
+    measured = iter([32.0, 31.0, 29.0])
+    monkeypatch.setattr(steering, "psnr", lambda *_: next(measured))
+    monkeypatch.setattr(steering, "open_state", lambda *_: None)
+    monkeypatch.setattr(halved, "config", halved.config.model_copy(update={"warm_up": 1.0}))
+    steering.steer(halved, Sweep(0, 0, (1, 2, 3), 0, 0))
+    after = Steered.before(halved.folder, 1)
+    assert (after.step, after.ceiling < 1) == (1, True)
+    assert after.following is None or not after.following.repeats
+
+
+def test_what_did_harm_is_done_again_in_front_of_the_same_halos_but_not_for_ever(halved, monkeypatch):
+    torch.save({"name": "the start", "psnr": 30.0}, halved.folder / "start.pt")
+    measured = iter([31.0, 29.0, 29.0, 29.0, 32.0, 29.0, 33.0])
+    monkeypatch.setattr(steering, "psnr", lambda *_: next(measured))
+    monkeypatch.setattr(steering, "open_state", lambda *_: None)
+    monkeypatch.setattr(steering, "rate_factor", lambda scene, step, ceiling: ceiling)
+    monkeypatch.setitem(halved.__dict__, "sweeps", [Sweep(0, 0, (1, 2, 3), 0, 0), Sweep(1, 3, (4,), 1, 1)])
+    made, sweep = [], sweep_of(halved, 0)
+    while sweep is not None:
+        steering.steer(halved, sweep)
+        after = Steered.before(halved.folder, sweep.number + 1)
+        made.append((sweep.first, sweep.checks, sweep.halos, sweep.repeats, after.step, after.ceiling))
+        sweep = sweep_of(halved, sweep.number + 1)
+    assert made == [
+        (0, (1, 2, 3), 0, 0, 1, 0.5),
+        (1, (2, 3), 0, 1, 1, 0.25),
+        (1, (2, 3), 0, 2, 1, 0.125),
+        (1, (2, 3), 0, 3, 2, 0.0625),
+        (3, (4,), 4, 0, 4, 0.0625),
+    ]
+
+
+def test_what_a_sweep_is_measured_by_is_what_it_began_with(halved, monkeypatch):
+    """A warm-up may lose a little, and what comes after it need not be better than the best of it."""
+    torch.save({"name": "the start", "psnr": 30.0}, halved.folder / "start.pt")
+    monkeypatch.setattr(steering, "open_state", lambda *_: None)
+    measured = iter([32.0, 31.0, 31.5, 31.45])
+    monkeypatch.setattr(steering, "psnr", lambda *_: next(measured))
+    halved.config = halved.config.model_copy(update={"warm_up": 0.5})
+    steering.steer(halved, Sweep(0, 0, (1, 2), 0, 0))
+    assert Steered.before(halved.folder, 1).psnr == 31.0
+    steering.steer(halved, Sweep(1, 2, (3, 4), 1, 1))
+    after = Steered.before(halved.folder, 2)
+    assert (after.sweep, after.step, after.ceiling, after.psnr) == (1, 4, 1.0, 31.45)
+
+
+def test_a_run_ends_with_the_sweep_that_reaches_the_target(job):
+    joined = adapt_in_tiles(replace(job, settings=job.settings | {"target_db": 5.0}), 2)
+    assert {tile["sweep"] for tile in joined.tiles} == {0}

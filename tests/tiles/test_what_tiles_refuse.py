@@ -1,0 +1,152 @@
+"""What cannot be cut into tiles is refused in a sentence, and what is left out is told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import anchor_checkpoints
+import numpy as np
+import pytest
+import tiny
+import torch
+from cut_scenes import cut_in_three
+
+from mipmap_plugin.cli import main
+from mipmap_plugin.errors import CheckpointError, SettingsError
+from mipmap_plugin.formats.magic import SPLAT_RECORD
+from mipmap_plugin.formats.ply import read_ply, write_ply
+from mipmap_plugin.models.health import ACTIVATED
+from mipmap_plugin.tiles.folder import work_folder
+from mipmap_plugin.tiles.reading import find_splats, make_cut
+from mipmap_plugin.tiles.report import make_report
+from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
+from mipmap_plugin.tiles.scene import opened
+
+
+def test_columns_that_tiles_do_not_hold_are_told_of(job):
+    [file] = job.base.checkpoint.rglob("*.ply")
+    columns = read_ply(file).columns
+    columns["nz"][-1] = 1  # normals, which 3DGS does not have
+    write_ply(file, columns | {"label": columns["x"]}, overwrite=True)
+    scene = cut_in_three(job)
+    with pytest.warns(UserWarning, match="the extra columns nx, ny, nz, label are dropped, since tiles hold none"):
+        assert make_report(scene, [file], {"total": 1.0}, {}, "the start").notes
+
+
+def test_places_that_float32_does_not_hold_are_told_of(job):
+    [file] = job.base.checkpoint.rglob("*.ply")
+    columns = read_ply(file).columns
+    write_ply(file, columns | {"x": columns["x"].astype(float) + 5e6}, overwrite=True)
+    folder = work_folder(job.target)
+    folder.mkdir()
+    with pytest.warns(UserWarning, match=r"80 of 80 splats lie so far .* steps of 0.5 units"):
+        make_cut(job.base.checkpoint, 2, folder)
+
+
+def test_splats_that_are_doubtful_or_left_out_are_told_of(job):
+    [file] = job.base.checkpoint.rglob("*.ply")
+    columns = {name: np.tile(column, 2) for name, column in read_ply(file).columns.items()}
+    columns["opacity"], columns["x"][0] = np.linspace(0, 1, 160, dtype=np.float32), np.nan
+    write_ply(file, columns, overwrite=True)
+    with pytest.warns(UserWarning, match=r"the opacities look like 0..1"), pytest.warns(UserWarning, match="1 of 160 splats was dropped"):
+        scene = cut_in_three(job)
+    doubts = [ACTIVATED, "1 of 160 splats was dropped: not finite once activated"]
+    assert make_report(scene, [file], {"total": 1.0}, {}, "the start").notes == doubts
+
+
+def test_invalid_splats_are_left_out(tmp_path, job):
+    ply = next(job.base.checkpoint.rglob("*.ply"))
+    columns = dict(read_ply(ply).columns)
+    columns["opacity"] = columns["opacity"].copy()
+    columns["opacity"][5] = float("nan")
+    write_ply(ply, columns, overwrite=True)
+    assert adapt_in_tiles(job, 2).report.gaussians_before == 79
+
+
+@pytest.mark.parametrize(
+    ("changes", "tiles", "reason"),
+    [
+        ({}, 1, "give at least 2, got 1"),
+        ({"scale": 4.0}, 2, "cut into tiles for a zoom-out"),
+        ({"scale": 1.0}, 2, "x1: the base is right as it is"),
+        ({"viewer": "portable"}, 2, "stands for several; give one of them"),
+        ({"settings": {"most_splats": 10}}, 2, "to no number of splats"),
+    ],
+)
+def test_requests_that_no_tiles_serve(job, changes, tiles, reason):
+    with pytest.raises(SettingsError, match=reason):
+        adapt_in_tiles(replace(job, **changes), tiles)
+    assert not work_folder(job.target).exists()
+
+
+def test_files_of_the_web_are_converted_before_they_are_cut(tmp_path):
+    rows = np.zeros(9, SPLAT_RECORD)
+    rows["scale"] = 0.1
+    rows.tofile(tmp_path / "my room.splat")
+    with pytest.raises(SettingsError, match=r"convert it first \(splat-transform 'my room.splat' 'my room_plain.ply'\), or leave --tiles out"):
+        find_splats(tmp_path / "my room.splat")
+    tiny.model(9).save(tmp_path / "room.glb", provenance={})
+    with pytest.raises(SettingsError, match=r"first \(load_model\('room.glb'\).save\(Path\('room_plain.ply'\), provenance={}\) in Python\)"):
+        find_splats(tmp_path / "room.glb")
+
+
+def test_anchors_cannot_be_cut(tmp_path, job):
+    folder = anchor_checkpoints.write(tmp_path / "anchors")
+    with pytest.raises(SettingsError, match="a checkpoint of scaffold cannot be cut into tiles"):
+        adapt_in_tiles(replace(job, base=replace(job.base, checkpoint=folder)), 2)
+
+
+def test_more_tiles_than_splats(job):
+    with pytest.raises(CheckpointError, match="has 80 splats, which cannot be cut into 90 tiles"):
+        adapt_in_tiles(job, 90)
+    assert not work_folder(job.target).exists()  # so that fewer may be tried
+
+
+def test_views_that_show_nothing_are_refused_and_leave_no_folder(job):
+    """The corrected command is another request, which a folder of this one would refuse."""
+    around = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
+    views = [replace(view, viewmat=around @ view.viewmat) for view in tiny.cameras(3, width=20, height=16)]
+    folder = tiny.folder(job.base.checkpoint.with_name("other"), views)
+    with pytest.raises(SettingsError, match="none of the 3 views shows a splat: the cameras seem to be of another scene"):
+        adapt_in_tiles(replace(job, base=replace(job.base, cameras=folder / "cameras.json")), 2)
+    assert not work_folder(job.target).exists()
+
+
+def test_validation_views_that_show_nothing_do_not_count(job, monkeypatch):
+    """As without tiles."""
+    around = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
+    views = tiny.cameras(5, seed=3, width=20, height=16)
+    away = [replace(view, viewmat=around @ view.viewmat) for view in views[:2]]
+    monkeypatch.setattr("mipmap_plugin.tiles.scene.split_validation", lambda cameras, chosen, *_: (chosen, [*away, *views[2:]]))
+    folder = work_folder(job.target)
+    folder.mkdir()
+    make_cut(job.base.checkpoint, 2, folder)
+    found = opened(job.base, job.scale, None, job.config(), folder).views
+    judged = torch.stack([view.viewmat for view in (*found.steering, *found.choosing)])
+    assert torch.equal(judged, torch.stack([views[number].viewmat for number in (2, 4, 3)]))
+
+
+def test_what_is_wrong_with_views_is_told(job, monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.adaptation.views.UNLIKE", 0.5)
+    with pytest.warns(UserWarning, match="adapt with the cameras of each lens on their own"):
+        adapt_in_tiles(replace(job, settings=job.settings | {"steps": 0}), 2)
+
+
+def test_jobs_of_several_bases_or_of_one_output_are_refused(job, tmp_path):
+    other = replace(job, target=job.target.with_name("other.ply"), base=replace(job.base, background="white"))
+    for jobs in ([job, other], [job, replace(job, scale=0.25)]):
+        with pytest.raises(SettingsError, match="those of one base, each with an output of its own"):
+            next(adapt_all_in_tiles(jobs, 2))
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        ("a.ply b.ply --scale 1/2 --tiles 2", "--tiles cuts one checkpoint"),
+        ("a.ply --scale 1/2 --tiles 2 --report", "without tiles"),
+        ("a.ply --scale 1/2 --tiles 2 --dask local:2 --send-files", "leave --send-files out"),
+    ],
+)
+def test_commands_that_cannot_be(words, reason, capsys):
+    assert main(["adapt", *words.split()]) == 2
+    assert reason in capsys.readouterr().err

@@ -1,0 +1,154 @@
+"""What is adapted in tiles is one whole scene, of one base, at one scale or at several, by the library and by the command."""
+
+from __future__ import annotations
+
+import json
+from contextlib import nullcontext
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import tiny
+from cut_scenes import base_pictures
+
+from mipmap_plugin.adaptation.optimization import loop
+from mipmap_plugin.cli import main
+from mipmap_plugin.formats.ply import read_header, read_ply
+from mipmap_plugin.models import load_model
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.mip import MipModel
+from mipmap_plugin.models.reading import load_vanilla
+from mipmap_plugin.tiles import plan, run
+from mipmap_plugin.tiles.reading import make_cut
+from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
+
+# The whole
+
+
+def test_a_scene_in_tiles_is_whole_and_better_than_its_base(job, monkeypatch):
+    bodies = []
+    keep = SimpleNamespace(rmtree=lambda folder: bodies.extend((folder / f"part_{n}.ply").read_bytes() for n in range(3)))
+    monkeypatch.setattr(run, "shutil", keep)
+    joined = adapt_in_tiles(replace(job, settings=job.settings | {"merge_to": 0.6}), 3)
+    report = joined.report
+    assert len(load_vanilla(joined.file)) == report.gaussians_after == sum(tile["splats_after"] for tile in joined.tiles[-3:])
+    assert report.gaussians_after < report.gaussians_before == 80
+    assert report.psnr_after() > report.psnr_before() and report.returned == "the joined tiles"
+    sidecar = json.loads(joined.file.with_name("out.ply.adaptation.json").read_text())
+    assert [(tile["sweep"], tile["tile"]) for tile in sidecar["tiles"]] == [(sweep, number) for sweep in (0, 1) for number in range(3)]
+    assert sidecar["validation"] == report.validation
+    assert '"tiles": 3' in " ".join(read_header(joined.file).comments)
+    # The cores stand in the file one after the other.
+    cores = b"".join(body[body.index(b"end_header\n") + 11 :] for body in bodies)
+    assert joined.file.read_bytes()[read_header(joined.file).body :] == cores
+
+
+def test_a_large_scene_takes_fewer_steps_in_tiles_too(job, monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.recipes.DEFAULT_OUT", dict(steps=16, most_draws=1.0, check_every=2))
+    settings = {name: value for name, value in job.settings.items() if name != "steps"}
+    report = adapt_in_tiles(replace(job, settings=settings), 2).report
+    assert report.settings.steps == report.curve[-1].step == 4
+    assert report.ended_by.startswith("2 tiles of 4 steps (of 16, because the scene is large")
+
+
+def test_a_file_for_a_filter_that_the_tag_does_not_tell_whole_is_read_back_with_its_dilation(job):
+    """The base of tiles too, as one that was converted at x1."""
+    base = tiny.folder(job.target.with_name("base"), trained=TrainedScale("mip", 0.1))
+    again = replace(job.base, checkpoint=next(base.rglob("point_cloud.ply")), cameras=base / "cameras.json")
+    for asked in (replace(job, viewer="mip"), replace(job, base=again, target=job.target.with_name("again.ply"))):
+        made = load_model(adapt_in_tiles(replace(asked, settings=job.settings | {"steps": 0}), 2).file)
+        assert (made.trained.screen_filter, made.trained.eps2d) == ("mip", 0.1)
+        assert isinstance(made, MipModel) == (asked.viewer == "mip")  # whose loader requires filter_3D
+
+
+def test_a_model_folder_is_written_as_one(job, tmp_path):
+    joined = adapt_in_tiles(replace(job, target=tmp_path / "out"), 2)
+    assert (tmp_path / "out" / "cameras.json").is_file() and (tmp_path / "out" / "cfg_args").is_file()
+    assert joined.file == tmp_path / "out" / "point_cloud" / "iteration_30000" / "point_cloud.ply"
+    assert len(load_vanilla(tmp_path / "out")) == joined.report.gaussians_after
+
+
+def test_a_model_folder_is_written_beside_the_checkpoint(job, capsys):
+    """Where the scale in its name looks like a suffix."""
+    words = ["adapt", str(job.base.checkpoint), "--scale", "1/2", "--steps", "0", "--views", "given", "--tiles", "2"]
+    assert main([*words, "--cameras", str(job.base.checkpoint.with_name("{name}") / "cameras.json")]) == 0
+    assert (job.base.checkpoint.with_name("scene_x0.5") / "point_cloud").is_dir()
+
+
+def test_the_bar_of_a_tile_says_which_it_is_and_no_db(job, monkeypatch):
+    """Which it has not: it is measured as a part of the whole."""
+    told, began = [], loop.Bar.__init__
+    monkeypatch.setattr(loop.Bar, "__init__", lambda bar, **options: (told.append(options["desc"]), began(bar, **options))[1])
+    monkeypatch.setattr(loop.Bar, "set_postfix_str", lambda bar, text: told.append(text))
+    monkeypatch.setattr(run, "announced", lambda what: (told.append(what), nullcontext())[1])
+    adapt_in_tiles(replace(job, settings=job.settings | {"closed_form": False, "steps": 2}), 2)
+    assert set(told) == {"cutting", "adapting tile 1 x0.5", "adapting tile 2 x0.5", "40 splats", "measuring the whole", "writing out.ply"}
+
+
+def test_no_tile_grows_beyond_what_the_settings_allow(job):
+    settings = dict(steps=8, prune_every=2, densify_gradient=1e-9, most_growth=1.2, views="given", validation_views=2)
+    assert 80 < adapt_in_tiles(replace(job, recipe="paper", settings=settings), 2).report.gaussians_after <= 96
+
+
+# Several scales
+
+
+def test_scales_share_the_cut_and_the_pictures_of_the_base(job, monkeypatch):
+    jobs = [replace(job, scale=scale, target=job.target.with_name(f"x{scale}.ply")) for scale in (0.5, 0.25)]
+    alone = adapt_in_tiles(replace(jobs[1], target=job.target.with_name("alone.ply")), 2).file
+    cuts, sizes = [], base_pictures(monkeypatch)
+    monkeypatch.setattr(plan, "make_cut", lambda *asked: (cuts.append(asked), make_cut(*asked)))
+    files = [joined.file for joined in adapt_all_in_tiles(jobs, 2)]
+    assert len(cuts) == 1 and sizes == [(16, 20)] * 5  # three views, and two of validation
+    assert read_ply(files[1]).columns["x"].tobytes() == read_ply(alone).columns["x"].tobytes()
+
+
+def test_scales_of_other_views_draw_their_own(job, monkeypatch):
+    """At x1/8 four samples a pixel are drawn from half of the base's pixels."""
+    jobs = [replace(job, scale=scale, target=job.target.with_name(f"x{scale}.ply")) for scale in (0.5, 0.125)]
+    sizes = base_pictures(monkeypatch)
+    assert all(joined.file.exists() for joined in adapt_all_in_tiles(jobs, 2))
+    assert sizes == [(16, 20)] * 5 + [(8, 10)] * 5
+
+
+# The command
+
+
+def test_the_command(job, capsys):
+    options = ["--scale", "1/2", "--steps", "0", "--views", "given", "--output", str(job.target)]
+    assert main(["adapt", str(job.base.checkpoint), *options, "--tiles", "2"]) == 0
+    out = capsys.readouterr().out
+    assert "x0.5, 2 tiles:" in out and str(job.target) in out
+    assert main(["adapt", str(job.base.checkpoint), *options, "--tiles", "2", "--skip-existing", "--overwrite"]) == 0
+    assert "finished before" in capsys.readouterr().out
+    assert main(["adapt", str(job.base.checkpoint), *options, "--tiles", "2", "--skip-existing", "--json"]) == 0
+    assert [report["file"] for report in json.loads(capsys.readouterr().out)] == [str(job.target)]
+
+
+def test_the_command_for_several_scales_skips_what_is_finished(job, capsys):
+    options = ["--steps", "0", "--views", "given", "--tiles", "2", "--scale", "1/2"]
+    assert main(["adapt", str(job.base.checkpoint), *options, "--json"]) == 0
+    capsys.readouterr()
+    assert main(["adapt", str(job.base.checkpoint), *options, "--scale", "1/4", "--json"]) == 0
+    reports = json.loads(capsys.readouterr().out)
+    assert [report["scale"] for report in reports] == [0.5, 0.25]
+
+
+def test_the_command_says_how_to_go_on_with_several_scales(job, capsys, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt("interrupted")
+        yield
+
+    monkeypatch.setattr(run, "adapt_all_in_tiles", interrupted)
+    options = ["adapt", str(job.base.checkpoint), "--steps", "0", "--tiles", "2", "--scale", "1/2"]
+    two = ["--scale", "1/4"]
+    for further, again in (([], "again to go on"), (two, "again to go on"), ([*two, "--overwrite"], "with --skip-existing")):
+        assert main([*options, *further]) == 130
+        assert again in capsys.readouterr().err
+
+
+def test_help_says_what_a_time_budget_is_of(capsys):
+    with pytest.raises(SystemExit):
+        main(["adapt", "--help"])
+    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "Maximum number of seconds for each file; with --tiles for each tile instead" in said
