@@ -81,6 +81,8 @@ def test_videos_of_deformable_are_those_of_its_loader(tmp_path, resolution, size
         (path / f"frames/cam{video:02d}").mkdir(parents=True)
         for frame in range(26):
             Image.fromarray(np.zeros((30, 40, 3), np.uint8)).save(path / f"frames/cam{video:02d}/{frame:03d}.png")
+    for place in ("frames", "frames/cam00"):
+        (path / place / ".DS_Store").touch()
     scene = load_scene(path, {"is_6dof": False, "eval": True, "resolution": resolution})
     tests, trains = scene.split("test"), scene.split("train")
     assert len(tests) == 24 and len(trains) == 3 * 24 and len(scene.images) == 96

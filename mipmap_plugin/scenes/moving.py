@@ -104,7 +104,7 @@ def read_hypernerf(path: Path, cfg: dict[str, Any] | None = None) -> Scene:
 
 def _videos_of_deformable(path: Path, poses: Tensor, cfg: dict[str, Any]) -> Scene:
     """The views of `poses` [P, 3, 5]; without frames at the recorded size. The focal length is that of the first camera, in pixels of the frames."""
-    folders = sorted(path.glob("frames/*"))
+    folders = sorted(folder for folder in path.glob("frames/*") if folder.is_dir())
     if folders and len(folders) != len(poses):
         raise SceneError(f"{path / 'frames'}: has {len(folders)} videos, but poses_bounds.npy has {len(poses)} cameras; copy all of them")
     height, width, focal = (positive(value, f"{path / 'poses_bounds.npy'}, row 0") for value in poses[0, :, 4].tolist())
@@ -114,9 +114,9 @@ def _videos_of_deformable(path: Path, poses: Tensor, cfg: dict[str, Any]) -> Sce
     for number, pose in enumerate(poses):
         viewmat = _viewmat(pose, f"{path / 'poses_bounds.npy'}, row {number}")
         folder = folders[number] if folders else path / "frames" / f"cam{number:02d}"
-        frames = sorted(folder.iterdir())[:FRAMES_OF_DEFORMABLE] if folders else [folder / f"{i:04d}.png" for i in range(FRAMES_OF_DEFORMABLE)]
+        found = sorted(folder.glob("[!.]*")) if folders else [folder / f"{moment:04d}.png" for moment in range(FRAMES_OF_DEFORMABLE)]
         split: Literal["train", "test"] = "test" if number == 0 and cfg.get("eval") else "train"
-        for moment, frame in enumerate(frames):
+        for moment, frame in enumerate(found[:FRAMES_OF_DEFORMABLE]):
             across, down = image_size(frame) if folders else recorded
             name, time = f"{folder.name}/{frame.stem}", moment / (FRAMES_OF_DEFORMABLE - 1)
             camera = Camera(across, down, focal, focal, across / 2, down / 2, viewmat, name, split, time)
