@@ -18,7 +18,7 @@ from mipmap_plugin.errors import SceneError
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.finished import _inputs
 from mipmap_plugin.jobs.job import Job
-from mipmap_plugin.scenes import load_scene, read_cameras, write_cameras
+from mipmap_plugin.scenes import load_photographs, load_scene, read_cameras, write_cameras
 
 
 def poses(count=4):
@@ -71,6 +71,35 @@ def test_extracted_dynerf_frames_belong_to_their_cameras(tmp_path):
     assert {path.relative_to(tmp_path / "s").as_posix() for path in scene.images.values()} == {
         *(f"cam00/images/000{i}.png" for i in range(3)), "cam01/images/0000.png", "cam02/images/0001.png", "cam03/images/0002.png",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("resolution, size", [(1, (40, 30)), (-1, (40, 30)), (2, (20, 15))])
+def test_videos_of_deformable_are_those_of_its_loader(tmp_path, resolution, size):
+    """readCamerasFromNpy: the first 24 frames of every video, from 0 to 1 in time, at their own size, to which the focal length refers."""
+    path = dynerf(tmp_path / "s")
+    for video in range(4):
+        (path / f"frames/cam{video:02d}").mkdir(parents=True)
+        for frame in range(26):
+            Image.fromarray(np.zeros((30, 40, 3), np.uint8)).save(path / f"frames/cam{video:02d}/{frame:03d}.png")
+    for place in ("frames", "frames/cam00"):
+        (path / place / ".DS_Store").touch()
+    scene = load_scene(path, {"is_6dof": False, "eval": True, "resolution": resolution})
+    tests, trains = scene.split("test"), scene.split("train")
+    assert len(tests) == 24 and len(trains) == 3 * 24 and len(scene.images) == 96
+    stored = np.load(path / "poses_bounds.npy")[:, :-2].reshape(-1, 3, 5)
+    turned = np.concatenate([stored[..., 1:2], -stored[..., :1], stored[..., 2:4]], -1)
+    for camera, video, frame in ((tests[7], 0, 7), (trains[0], 1, 0), (trains[71], 3, 23)):
+        assert scene.images[camera] == path / f"frames/cam{video:02d}/{frame:03d}.png"
+        assert np.allclose(camera.viewmat.numpy(), project_pose(turned[video]), atol=1e-9)
+        assert ((camera.width, camera.height), camera.fx, camera.fy, camera.time) == (size, 1460 * size[0] / 40, 1460 * size[1] / 30, frame / 23)
+
+
+def test_videos_of_deformable_without_frames_have_the_recorded_size(tmp_path):
+    path, cfg = dynerf(tmp_path / "s"), {"is_6dof": False, "resolution": -1}
+    scene = load_scene(path, cfg)
+    assert len(scene.split("train")) == 96 and not scene.images
+    assert {(camera.width, camera.height) for camera in scene.cameras} == {(1600, 1200)} and scene.cameras[0].fx == pytest.approx(1460 * 1600 / 2704)
+    assert {(camera.width, camera.height) for camera in load_photographs(path, cfg).cameras} == {(2704, 2028)}
 
 
 def hypernerf(path, count=9, val=True, rgb=True):

@@ -143,7 +143,10 @@ class Adapted:
         exact, written = self.report.psnr_after(), self.written.get(path, {}).get("written")
         if exact is None or written is None or written >= exact - HARM_DB:
             return ""
-        return f"{path.name}: its format rounds splats, which costs {exact - written:.2f} dB on views that nothing was adapted to; a .ply keeps them"
+        base = self.report.psnr_before()
+        worse = base is not None and written < base
+        advice = f"the file is worse than its base ({base:.2f} dB); keep the base, or give a .ply" if worse else "a .ply keeps them"
+        return f"{path.name}: its format rounds splats, which costs {exact - written:.2f} dB on views that nothing was adapted to; {advice}"
 
     def _drawn_otherwise(self, path: Path) -> str:
         return "" if self.report.viewer else drawn_otherwise(path, self.model.trained)

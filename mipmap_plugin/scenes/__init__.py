@@ -38,9 +38,9 @@ def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     scene, one of DyNeRF or HyperNeRF as 4DGaussians reads them, or a PLY that has a camera in it (`cameras_in`).
 
     `cfg` is the checkpoint's cfg_args, which determine the test split and training size (`read_cameras`, `read_colmap`, `read_transforms`), and
-    the frame of HyperNeRF's captures, which Deformable 3D Gaussians moves and scales; without it (a lone file, exported from a model folder) a
-    cameras.json is read with the cfg_args beside it. A folder with both COLMAP's `sparse` and transforms files is read from `sparse`, as
-    graphdeco-inria does.
+    the frame of HyperNeRF's captures, which Deformable 3D Gaussians moves and scales, and which frames of DyNeRF's it takes; without it (a lone
+    file, exported from a model folder) a cameras.json is read with the cfg_args beside it. A folder with both COLMAP's `sparse` and
+    transforms files is read from `sparse`, as graphdeco-inria does.
     Raises SceneError.
     """
     path = path_of(path)
@@ -55,7 +55,7 @@ def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     if any(path.glob("transforms*.json")):
         return read_transforms(path, cfg)
     if is_dynerf(path):
-        return read_dynerf(path)
+        return read_dynerf(path, cfg)
     if is_hypernerf(path):
         return read_hypernerf(path, cfg)
     if is_colmap(path):
@@ -67,11 +67,11 @@ def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
 def load_photographs(path: str | Path, cfg: dict[str, Any]) -> Scene:
     """The scene at `path` with photographs at their own size, whatever size a checkpoint with these cfg_args was trained at.
 
-    Only those options count by which Deformable 3D Gaussians moves and scales HyperNeRF's captures, and others take lenses of COLMAP for pinholes.
+    Only those options count by which Deformable 3D Gaussians reads captures of DyNeRF and HyperNeRF, and others take lenses of COLMAP for pinholes.
     Raises SceneError.
     """
     path = path_of(path)
-    if DEFORMABLE in cfg and is_hypernerf(path):
+    if DEFORMABLE in cfg and (is_dynerf(path) or is_hypernerf(path)):
         return load_scene(path, {**cfg, "resolution": 1})
     return load_scene(path, {name: cfg[name] for name in (*UNBENT, "eval") if name in cfg} if unbent_by(cfg) and is_colmap(path) else None)
 

@@ -1,7 +1,7 @@
 """Scenes of 4DGaussians without transforms files: DyNeRF's videos (poses_bounds.npy) and HyperNeRF's captures (dataset.json).
 
 Poses, intrinsics, sizes, times and splits are those of that project's scene/neural_3D_dataset_NDC.py and scene/hyper_loader.py; and those of
-scene/dataset_readers.py in Deformable 3D Gaussians (`readNerfiesCameras`).
+scene/dataset_readers.py in Deformable 3D Gaussians (`readNerfiesCameras`, `readCamerasFromNpy`).
 """
 
 from __future__ import annotations
@@ -23,6 +23,9 @@ from mipmap_plugin.scenes.transforms import viewmat_from_opengl
 # DyNeRF: px of the recorded width, to which focal lengths refer, and of the training size; and the number of frames of a video.
 RECORDED, WIDTH, HEIGHT, FRAMES = 2704, 1352, 1014, 300
 
+# DyNeRF by Deformable 3D Gaussians: the number of frames of a video.
+FRAMES_OF_DEFORMABLE = 24
+
 # HyperNeRF: photographs are taken at half their size; without a list of test views, every fourth view is for training.
 HALF, EVERY = 2, 4
 
@@ -39,13 +42,19 @@ def is_hypernerf(path: Path) -> bool:
     return (path / "dataset.json").is_file() and (path / "camera").is_dir()
 
 
-def read_dynerf(path: Path) -> Scene:
+def read_dynerf(path: Path, cfg: dict[str, Any] | None = None) -> Scene:
     """The cameras of all videos, the first for testing. Training cameras take turns, so that together they have one view per frame. Frames
-    are in cam<NN>/images, if they were extracted. Raises SceneError."""
+    are in cam<NN>/images, if they were extracted.
+
+    With the cfg_args (`cfg`) of Deformable 3D Gaussians, as that does: in frames/<video>, of which every camera has the first 24, at their own size.
+    Raises SceneError.
+    """
     rows = read_array(path / "poses_bounds.npy")
     if rows.dim() != 2 or rows.shape[1] != 17 or len(rows) < 2:
         raise SceneError(f"{path / 'poses_bounds.npy'}: expected one row of 17 numbers for each of several cameras, got {list(rows.shape)}")
     poses = rows[:, :15].reshape(-1, 3, 5)
+    if cfg and DEFORMABLE in cfg:
+        return _videos_of_deformable(path, poses, cfg)
     videos = sorted({entry.name.partition(".")[0] for entry in path.glob("cam*")}) or [f"cam{number:02d}" for number in range(len(poses))]
     if len(videos) != len(poses):
         raise SceneError(f"{path}: has {len(videos)} videos ({videos[0]}, ...), but poses_bounds.npy has {len(poses)} cameras; copy all of them")
@@ -93,15 +102,43 @@ def read_hypernerf(path: Path, cfg: dict[str, Any] | None = None) -> Scene:
     return Scene(tuple(cameras), images, path, [f"{len(cameras)} of {len(names)} views of a HyperNeRF capture, at 1/{shrunk} of its size"])
 
 
+def _videos_of_deformable(path: Path, poses: Tensor, cfg: dict[str, Any]) -> Scene:
+    """The views of `poses` [P, 3, 5]; without frames at the recorded size. The focal length is that of the first camera, in pixels of the frames."""
+    folders = sorted(folder for folder in path.glob("frames/*") if folder.is_dir())
+    if folders and len(folders) != len(poses):
+        raise SceneError(f"{path / 'frames'}: has {len(folders)} videos, but poses_bounds.npy has {len(poses)} cameras; copy all of them")
+    height, width, focal = (positive(value, f"{path / 'poses_bounds.npy'}, row 0") for value in poses[0, :, 4].tolist())
+    recorded, resized = (max(1, round(width)), max(1, round(height))), {"resolution": cfg.get("resolution", 1)}
+    cameras: list[Camera] = []
+    images: dict[Camera, Path] = {}
+    for number, pose in enumerate(poses):
+        viewmat = _viewmat(pose, f"{path / 'poses_bounds.npy'}, row {number}")
+        folder = folders[number] if folders else path / "frames" / f"cam{number:02d}"
+        found = sorted(folder.glob("[!.]*")) if folders else [folder / f"{moment:04d}.png" for moment in range(FRAMES_OF_DEFORMABLE)]
+        split: Literal["train", "test"] = "test" if number == 0 and cfg.get("eval") else "train"
+        for moment, frame in enumerate(found[:FRAMES_OF_DEFORMABLE]):
+            across, down = image_size(frame) if folders else recorded
+            name, time = f"{folder.name}/{frame.stem}", moment / (FRAMES_OF_DEFORMABLE - 1)
+            camera = Camera(across, down, focal, focal, across / 2, down / 2, viewmat, name, split, time)
+            cameras.append(camera.resized(*trained_size(across, down, resized)))
+            if folders:
+                images[cameras[-1]] = frame
+    return Scene(tuple(cameras), images, path, [f"{len(poses)} videos of {FRAMES_OF_DEFORMABLE} frames, as Deformable 3D Gaussians reads them"])
+
+
 def _of_video(pose: Tensor, video: str, moment: int, split: Literal["train", "test"], where: str) -> Camera:
+    """`pose` as in `_viewmat`, at the training size of 4DGaussians."""
+    focal = positive(pose[2, 4].item(), f"{where}, focal length") * WIDTH / RECORDED
+    return Camera(WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, _viewmat(pose, where), f"{video}/{moment:04d}", split, moment / FRAMES)
+
+
+def _viewmat(pose: Tensor, where: str) -> Tensor:
     """`pose` [3, 5] in LLFF's convention: the camera's axes down, right and backwards, its position, and (height, width, focal length)."""
-    down, right, back, eye, lens = pose.unbind(1)
+    down, right, back, eye, _ = pose.unbind(1)
     to_world = torch.eye(4, dtype=torch.float64)
     to_world[:3, :3] = rotation(torch.stack([right, -down, back], 1).tolist(), where)
     to_world[:3, 3] = eye
-    focal = positive(lens[2].item(), f"{where}, focal length") * WIDTH / RECORDED
-    viewmat = viewmat_from_opengl(to_world)
-    return Camera(WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, viewmat, f"{video}/{moment:04d}", split, moment / FRAMES)
+    return viewmat_from_opengl(to_world)
 
 
 def _object(file: Path) -> dict[str, Any]:

@@ -208,6 +208,9 @@ def test_the_db_of_a_file_are_of_what_its_format_keeps(tmp_path, capsys):
     assert picture["mean"] == {"psnr_db": report["written"]} and picture["view"]["psnr_db"] < exact - 1
     assert f"→ {report['written']:.1f} dB on views" in record["lead"] and record["adaptations"][0]["written"] == report["written"]
     assert "its format rounds splats, which costs" in said.err and any("its format rounds splats" in note for note in report["notes"])
+    base = report["validation"]["the base as it is"]
+    worse = f"the file is worse than its base ({base:.2f} dB); keep the base, or give a .ply"
+    assert report["written"] < base and worse in said.err and any(worse in note for note in report["notes"])
 
 
 @pytest.mark.usefixtures("small_orbits", "rounding")
