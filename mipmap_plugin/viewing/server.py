@@ -9,6 +9,7 @@ import socket
 import warnings
 from collections.abc import Iterator, Mapping
 from http import HTTPStatus
+from importlib import import_module
 from typing import Any
 
 from mipmap_plugin.errors import SettingsError, install
@@ -38,8 +39,7 @@ def served(host: str, port: int) -> Any:
 def _own_pages_only() -> Iterator[None]:
     """Let pages of others not talk to what viser serves inside the block, for which it has no setting: a browser lets each of its pages reach this
     machine, and so see the scene, adapt and save."""
-    from websockets.asyncio import server
-
+    server: Any = import_module("websockets.asyncio.server")  # an extra's, whose types mypy may lack
     serve = server.serve
 
     def guarded(*args: Any, process_request: Any, **options: Any) -> Any:
@@ -51,11 +51,11 @@ def _own_pages_only() -> Iterator[None]:
 
         return serve(*args, process_request=answer, **options)
 
-    server.serve = guarded  # type: ignore[assignment,misc]
+    server.serve = guarded
     try:
         yield
     finally:
-        server.serve = serve  # type: ignore[misc]
+        server.serve = serve
 
 
 def foreign_page(headers: Mapping[str, str]) -> bool:
