@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
 import subprocess
 import sys
 import time
+import weakref
 import zipfile
+from unittest.mock import Mock
 
 import pressing
 import pytest
@@ -117,6 +120,28 @@ def test_ctrl_c_twice_around_the_last_step_does_not_break_off_what_follows():
             signal.raise_signal(signal.SIGINT)
             removed.append(True)
     assert removed
+
+
+class Deleted:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+
+def finalized():
+    """An object whose finalizer presses Ctrl-C."""
+    made = Mock()
+    weakref.finalize(made, signal.raise_signal, signal.SIGINT)
+    return made
+
+
+@pytest.mark.parametrize("make", [Deleted, finalized])
+def test_ctrl_c_while_an_object_is_deleted_is_heard_after_that(make):
+    """Where Python would drop it: the live view went on once."""
+    with ends_as_by_ctrl_c(), pytest.raises(KeyboardInterrupt):
+        made = make()
+        del made
+        gc.collect()
+        time.sleep(20)
 
 
 def test_ctrl_c_is_heard_where_the_first_was_lost():

@@ -3,10 +3,12 @@ gone on from, and removes what is temporary. For commands, not for libraries: si
 
 from __future__ import annotations
 
+import _thread
 import signal
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -19,6 +21,9 @@ SAME_S = 5.0
 
 # Seconds in which a further Ctrl-C counts as the same: an impatient hand presses twice, before it can see what the first one did.
 TWICE_S = 1.0
+
+# Seconds after which Ctrl-C is heard that came where Python drops exceptions.
+AGAIN_S = 0.02
 
 # The exit code of a process that was interrupted by Ctrl-C. Of one that another signal ended it is 128 more than the signal's number.
 INTERRUPTED = 130
@@ -51,9 +56,13 @@ class Ending:
     def pressed(self, number: int, frame: FrameType | None) -> None:
         """Raise KeyboardInterrupt, but not a second time in the middle of what the first one has removed or kept.
 
-        The first one may be lost, as where Python imports or finalizes; then the second one has to be heard.
+        The first one may be lost, as where Python imports; then the second one has to be heard.
         """
-        if self.presses.is_new() or not isinstance(sys.exc_info()[1], KeyboardInterrupt):
+        if _is_dropped_in(frame):
+            again = threading.Timer(AGAIN_S, _press_again)
+            again.daemon = True
+            again.start()
+        elif self.presses.is_new() or not isinstance(sys.exc_info()[1], KeyboardInterrupt):
             raise KeyboardInterrupt
 
     def heard(self, number: int, frame: FrameType | None) -> None:
@@ -66,6 +75,23 @@ class Ending:
         if not callable(on_ctrl_c):
             raise KeyboardInterrupt
         on_ctrl_c(signal.SIGINT, frame)
+
+
+def _is_dropped_in(frame: FrameType | None) -> bool:
+    """Whether Python only tells of an exception that is raised here: in what is called when an object is deleted, as of each picture drawn."""
+    while frame is not None:
+        if frame.f_code.co_filename == weakref.__file__ or frame.f_code.co_name == "__del__":
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _press_again() -> None:
+    main = threading.main_thread().ident
+    if main is not None and hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(main, signal.SIGINT)
+    else:  # Windows: what the main thread waits for is not broken off
+        _thread.interrupt_main()
 
 
 def presses() -> Presses:
