@@ -1,5 +1,6 @@
 """Files made for a viewer: adapted as it draws, and named after it."""
 
+from unittest.mock import Mock
 
 import anchor_checkpoints
 import moving
@@ -7,6 +8,7 @@ import pytest
 import tiny
 
 from mipmap_plugin.cli import main
+from mipmap_plugin.commands.adapt import _made_for
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.formats.ply import read_ply
@@ -100,4 +102,10 @@ def test_the_command_writes_a_file_for_each_viewer_and_says_what_it_holds(tmp_pa
 def test_the_command_says_whom_a_file_without_a_viewer_is_for(tmp_path, capsys):
     words = ["adapt", tiny.folder(tmp_path / "base", tiny.cameras(3)), "--scale", "1/4", "--recipe", "instant"]
     assert main([str(word) for word in words]) == 0
-    assert "made for renderers that draw as 3DGS does (INRIA, gsplat, nerfstudio); for others give --viewer spark" in capsys.readouterr().out
+    renderers = "made for renderers that draw as 3DGS does (INRIA, and gsplat and nerfstudio where no splat is nearer than 0.2 units)"
+    assert f"{renderers}; for others give --viewer spark" in capsys.readouterr().out
+
+
+def test_a_file_of_a_base_that_gsplat_trained_is_for_inria_s_viewer_too_if_nothing_is_near():
+    said = _made_for(Mock(viewer=None), tiny.model(3, TrainedScale(near_plane=0.01)))
+    assert "3DGS does (gsplat, nerfstudio, and INRIA where no splat is nearer than 0.2 units)" in said

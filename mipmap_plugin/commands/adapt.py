@@ -211,6 +211,7 @@ def _fitting(model: SplatModel, most: int | None) -> Sequence[float]:
 
 def _made_for(report: Report, model: SplatModel) -> str:
     """What a file is made for, and how to have one made for something else."""
+    from mipmap_plugin.effects import NEAR_PLANE
     from mipmap_plugin.models.base import why_no_viewer
 
     if report.viewer:
@@ -220,8 +221,10 @@ def _made_for(report: Report, model: SplatModel) -> str:
     advice = "; for others give --viewer spark, supersplat, ..."
     if (trained := model.trained).keeps_filter:
         return f"made for its own project, whose filter it keeps{advice}"
-    own = f"its training did ({trained.screen_filter}, {trained.eps2d:g} px²)"
-    return f"made for renderers that draw as {own if trained.screen_filter != 'classic' else '3DGS does (INRIA, gsplat, nerfstudio)'}{advice}"
+    if trained.screen_filter != "classic":
+        return f"made for renderers that draw as its training did ({trained.screen_filter}, {trained.eps2d:g} px²){advice}"
+    first, then = ("INRIA", "gsplat and nerfstudio") if trained.near_plane == NEAR_PLANE else ("gsplat, nerfstudio", "INRIA")
+    return f"made for renderers that draw as 3DGS does ({first}, and {then} where no splat is nearer than {NEAR_PLANE:g} units){advice}"
 
 
 def _say(saved: Path, report: Report, model: SplatModel) -> None:

@@ -149,7 +149,7 @@ def rebuild(model: SplatModel, form: Callable[[Gaussians], Gaussians]) -> None:
     made: list[int] = []
 
     def counted(gaussians: Gaussians) -> Gaussians:
-        formed = form(gaussians if gaussians.covariances is None else by_axes(gaussians))
+        formed = form(by_axes(gaussians))
         made.append(len(formed))
         return formed
 
