@@ -9,7 +9,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from mipmap_plugin.backends.cpu_kernels import inner
-from mipmap_plugin.backends.cpu_kernels.lanes import INTS32, LANES, VECTOR32, WIDTH
+from mipmap_plugin.backends.cpu_kernels.lanes import LANES, WIDTH, pattern
 from mipmap_plugin.backends.cpu_kernels.layout import OUTLINE_FIELDS
 from mipmap_plugin.backends.cpu_kernels.memory import load, rows_of, store
 
@@ -17,9 +17,9 @@ CHANNELS, BANDS = 3, WIDTH
 THREE = types.UniTuple(LANES, CHANNELS)
 
 
-def _shuffled(builder, first, second, pattern):
-    """The numbers of two vectors, of which the second's count from 16, at the positions of a pattern."""
-    return builder.shuffle_vector(first, second, ir.Constant(INTS32, pattern))
+def _shuffled(builder, first, second, places):
+    """The numbers of two vectors at these places, of which the second's count from 16."""
+    return builder.shuffle_vector(first, second, pattern(places))
 
 
 @inner
@@ -51,8 +51,8 @@ def apart(_context, rows):
             places = [rows.count * row + column for row in range(WIDTH)]
             found = _shuffled(builder, vectors[0], vectors[1], [min(place, 2 * WIDTH - 1) for place in places])
             for number in range(2, rows.count):
-                pattern = [row if place < number * WIDTH else WIDTH + min(place - number * WIDTH, WIDTH - 1) for row, place in enumerate(places)]
-                found = _shuffled(builder, found, vectors[number], pattern)
+                taken = [row if place < number * WIDTH else WIDTH + min(place - number * WIDTH, WIDTH - 1) for row, place in enumerate(places)]
+                found = _shuffled(builder, found, vectors[number], taken)
             columns.append(found)
         return cgutils.pack_array(builder, columns)
 
@@ -69,8 +69,8 @@ def together(_context, columns):
             places = [divmod(WIDTH * number + lane, columns.count) for lane in range(WIDTH)]  # the row and the column of each
             found = vectors[0]
             for column in range(1, columns.count):
-                pattern = [WIDTH + row if of == column else row if column == 1 else lane for lane, (row, of) in enumerate(places)]
-                found = _shuffled(builder, found, vectors[column], pattern)
+                taken = [WIDTH + row if of == column else row if column == 1 else lane for lane, (row, of) in enumerate(places)]
+                found = _shuffled(builder, found, vectors[column], taken)
             rows.append(found)
         return cgutils.pack_array(builder, rows)
 
@@ -82,8 +82,8 @@ def thrice(_context, bands):
     """The number of each band, once for each of its coefficients."""
 
     def generate(context, builder, signature, values):
-        patterns = [[(WIDTH * part + lane) // CHANNELS for lane in range(WIDTH)] for part in range(CHANNELS)]
-        return cgutils.pack_array(builder, [_shuffled(builder, values[0], values[0], pattern) for pattern in patterns])
+        parts = [[(WIDTH * part + lane) // CHANNELS for lane in range(WIDTH)] for part in range(CHANNELS)]
+        return cgutils.pack_array(builder, [_shuffled(builder, values[0], values[0], places) for places in parts])
 
     return THREE(bands), generate
 
@@ -93,11 +93,11 @@ def repeated(_context, red, green, blue):
     """A number of each channel, float32, once for each of its coefficients."""
 
     def generate(context, builder, signature, values):
-        once = ir.Constant(VECTOR32, ir.Undefined)
+        once = ir.Constant(LANES.vector, ir.Undefined)
         for channel, value in enumerate(values):
             once = builder.insert_element(once, value, ir.IntType(32)(channel))
-        patterns = [[(WIDTH * part + lane) % CHANNELS for lane in range(WIDTH)] for part in range(CHANNELS)]
-        return cgutils.pack_array(builder, [_shuffled(builder, once, once, pattern) for pattern in patterns])
+        parts = [[(WIDTH * part + lane) % CHANNELS for lane in range(WIDTH)] for part in range(CHANNELS)]
+        return cgutils.pack_array(builder, [_shuffled(builder, once, once, places) for places in parts])
 
     return THREE(types.float32, types.float32, types.float32), generate
 
@@ -107,7 +107,7 @@ def transpose(_context, source, target):
     """Write the transpose of 16 x 16 float32 at one pointer to another: blocks that lie across from each other are swapped, ever larger ones."""
 
     def generate(context, builder, signature, values):
-        read, written = (builder.bitcast(value, VECTOR32.as_pointer()) for value in values)
+        read, written = (builder.bitcast(value, LANES.vector.as_pointer()) for value in values)
         rows = [builder.load(builder.gep(read, [ir.IntType(64)(row)]), align=4) for row in range(WIDTH)]
         for row, vector in enumerate(_transposed(builder, rows)):
             builder.store(vector, builder.gep(written, [ir.IntType(64)(row)]), align=4)
@@ -145,7 +145,7 @@ def outlines(_context, table, splats, begin, end):
             address = builder.gep(data, [builder.mul(builder.sext(splat, i64), fields)])
             return builder.load(builder.bitcast(address, half.as_pointer()), align=4)
 
-        beside = ir.Constant(INTS32, list(range(WIDTH)))
+        beside = pattern(range(WIDTH))
         rows = [builder.shuffle_vector(outline(row), outline(row + OUTLINE_FIELDS), beside) for row in range(OUTLINE_FIELDS)]
         return cgutils.pack_array(builder, _transposed(builder, rows))
 

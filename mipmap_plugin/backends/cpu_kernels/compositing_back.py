@@ -6,8 +6,8 @@
 from mipmap_plugin.backends.cpu_kernels import inner, integrals, kernel, layout
 from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA
 from mipmap_plugin.backends.cpu_kernels.compositing import fill_range, log_alpha, tile_box
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, broadcast, fma, lowest_bit, total, totals
-from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, row_of, store_half
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, fma, lowest_bit, summed, summed_product, total, totals, zero_sum
+from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, row_of, store
 from mipmap_plugin.backends.cpu_kernels.patches import BATCH, prefetch_rows
 from mipmap_plugin.backends.cpu_kernels.planes import (
     BEHIND_DOT_GRAD,
@@ -106,7 +106,7 @@ def undraw_splat(splat, limits, fades, patches, n, box, state, grads):
     fades: a compile-time constant, so that splats that do not fade skip the extra work.
     """
     offset, color = splat[layout.OFFSET], (splat[layout.RED], splat[layout.GREEN], splat[layout.BLUE])
-    sum_1 = sum_u = sum_y = sum_uu = sum_uy = sum_yy = sum_red = sum_green = sum_blue = broadcast(0)
+    sum_1 = sum_u = sum_y = sum_uu = sum_uy = sum_yy = sum_red = sum_green = sum_blue = zero_sum()
     while patches != 0:
         patch = lowest_bit(patches)
         patches &= patches - 1
@@ -114,33 +114,34 @@ def undraw_splat(splat, limits, fades, patches, n, box, state, grads):
         power = log_alpha(splat, dx, dy)
         alpha, u = fma(exp2(power), splat[layout.GAIN], 0 - offset), fma(dy, 0 - splat[layout.SHEAR], dx)
         s, d_alpha, weight, d_red, d_green, d_blue = unblend(alpha, power >= LOG_MIN_ALPHA, limits, color, n, patch * WIDTH, state)
-        sum_1 = sum_1 + s
+        sum_1 = summed(sum_1, s)
         if fades:
             s = fma(d_alpha, offset, s)  # the offset does not depend on the shape
         s_u, s_y = s * u, s * dy
-        sum_u, sum_y = sum_u + s_u, sum_y + s_y
-        sum_uu, sum_uy, sum_yy = fma(s_u, u, sum_uu), fma(s_u, dy, sum_uy), fma(s_y, dy, sum_yy)
-        sum_red, sum_green, sum_blue = fma(weight, d_red, sum_red), fma(weight, d_green, sum_green), fma(weight, d_blue, sum_blue)
+        sum_u, sum_y = summed(sum_u, s_u), summed(sum_y, s_y)
+        sum_uu, sum_uy, sum_yy = summed_product(sum_uu, s_u, u), summed_product(sum_uy, s_u, dy), summed_product(sum_yy, s_y, dy)
+        sum_red, sum_green = summed_product(sum_red, weight, d_red), summed_product(sum_green, weight, d_green)
+        sum_blue = summed_product(sum_blue, weight, d_blue)
     write_sums((sum_1, sum_u, sum_y, sum_uu, sum_uy, sum_yy, sum_red, sum_green), sum_blue, grads)
 
 
 @inner
 def write_sums(sums, last, grads):
-    """Write a splat's row of the gradient table: the totals of 8 lanes, and of the last."""
-    store_half(grads, totals(sums))
+    """Write a splat's row of the gradient table: the totals of 8 sums, and of the last."""
+    store(grads, 0, totals(sums))
     grads[layout.GRADS - 1] = total(last)
 
 
 @inner
 def undraw_culled(splat, patches, n, box, state, grads):
     """Write the gradient of a culled splat, which only its gate has."""
-    color, sum_1 = (splat[layout.RED], splat[layout.GREEN], splat[layout.BLUE]), broadcast(0)
+    color, sum_1 = (splat[layout.RED], splat[layout.GREEN], splat[layout.BLUE]), zero_sum()
     while patches != 0:
         patch = lowest_bit(patches)
         patches &= patches - 1
         power = log_alpha(splat, *distances(splat, patch, box))
         alpha = fma(exp2(power), splat[layout.GAIN], 0 - splat[layout.OFFSET])
-        sum_1 = sum_1 + grad_culled(alpha, power >= LOG_MIN_ALPHA, color, n, patch * WIDTH, state)
+        sum_1 = summed(sum_1, grad_culled(alpha, power >= LOG_MIN_ALPHA, color, n, patch * WIDTH, state))
     for k in range(layout.GRADS):
         grads[k] = 0
     grads[layout.SUM] = total(sum_1)
@@ -150,14 +151,15 @@ def undraw_culled(splat, patches, n, box, state, grads):
 def undraw_integral(splat, limits, patches, n, box, state, grads):
     """As `undraw_splat`, for a splat that is integrated over pixels."""
     color = splat[layout.RED], splat[layout.GREEN], splat[layout.BLUE]
-    sum_1 = sum_u = sum_v = sum_log_long = sum_log_short = sum_angle = sum_red = sum_green = sum_blue = broadcast(0)
+    sum_1 = sum_u = sum_v = sum_log_long = sum_log_short = sum_angle = sum_red = sum_green = sum_blue = zero_sum()
     while patches != 0:
         patch = lowest_bit(patches)
         patches &= patches - 1
         alpha, by_u, by_v, by_log_long, by_log_short, by_angle = integrals.alpha_slopes(splat, *distances(splat, patch, box))
         s, _, weight, d_red, d_green, d_blue = unblend(alpha, alpha >= MIN_ALPHA, limits, color, n, patch * WIDTH, state)
-        sum_1, sum_u, sum_v = sum_1 + s, fma(s, by_u, sum_u), fma(s, by_v, sum_v)
-        sum_log_long, sum_log_short = fma(s, by_log_long, sum_log_long), fma(s, by_log_short, sum_log_short)
-        sum_angle = fma(s, by_angle, sum_angle)
-        sum_red, sum_green, sum_blue = fma(weight, d_red, sum_red), fma(weight, d_green, sum_green), fma(weight, d_blue, sum_blue)
+        sum_1, sum_u, sum_v = summed(sum_1, s), summed_product(sum_u, s, by_u), summed_product(sum_v, s, by_v)
+        sum_log_long, sum_log_short = summed_product(sum_log_long, s, by_log_long), summed_product(sum_log_short, s, by_log_short)
+        sum_angle = summed_product(sum_angle, s, by_angle)
+        sum_red, sum_green = summed_product(sum_red, weight, d_red), summed_product(sum_green, weight, d_green)
+        sum_blue = summed_product(sum_blue, weight, d_blue)
     write_sums((sum_1, sum_u, sum_v, sum_log_long, sum_log_short, sum_angle, sum_red, sum_green), sum_blue, grads)

@@ -1,8 +1,10 @@
-"""SIMD vectors: 16 float32 or 16 float64 lanes, as types that numba compiles straight to vector registers.
+"""SIMD vectors: lanes of float32 or float64, as types that numba compiles straight to vector registers.
 
 Plain loops are vectorized only when LLVM decides to, and a loop that silently is not runs five times slower. With types of their own,
-`a + b` on lanes is one vector addition on every processor. Scalars mix in freely and are broadcast to all lanes; the two types mix
+`a + b` on lanes is one vector addition on every processor. Scalars mix in freely and are broadcast to all lanes; float32 and float64 mix
 only through `wide` and `narrow`. Nothing is reassociated, so equal inputs give equal bits.
+
+There are WIDTH lanes, unless a docstring says otherwise.
 """
 
 # numba redefines calls and operators.
@@ -18,89 +20,94 @@ from numba.extending import intrinsic, lower_builtin, models, register_model, ty
 
 WIDTH = 16
 
-VECTOR32 = ir.VectorType(ir.FloatType(), WIDTH)
-VECTOR64 = ir.VectorType(ir.DoubleType(), WIDTH)
-INTS32 = ir.VectorType(ir.IntType(32), WIDTH)
-INTS64 = ir.VectorType(ir.IntType(64), WIDTH)
+
+class Lanes(types.Type):
+    """So many numbers, float32 or float64."""
+
+    def __init__(self, number, width):
+        self.number, self.width = number, width
+        super().__init__(f"{number}x{width}")
+
+    @property
+    def vector(self):
+        """LLVM's type."""
+        return ir.VectorType(ir.DoubleType() if self.number == types.float64 else ir.FloatType(), self.width)
 
 
-class _Lanes(types.Type):
-    """WIDTH float32."""
+class Mask(types.Type):
+    """So many booleans."""
+
+    def __init__(self, width):
+        self.width = width
+        super().__init__(f"boolx{width}")
 
 
-class _Doubles(types.Type):
-    """WIDTH float64."""
+LANES, DOUBLES = Lanes(types.float32, WIDTH), Lanes(types.float64, WIDTH)
 
 
-class _Mask(types.Type):
-    """WIDTH booleans."""
-
-
-LANES, DOUBLES, MASK = _Lanes("lanes"), _Doubles("doubles"), _Mask("mask")
-
-
-@register_model(_Lanes)
+@register_model(Lanes)
 class _LanesModel(models.PrimitiveModel):
     def __init__(self, manager, kind):
-        super().__init__(manager, kind, VECTOR32)
+        super().__init__(manager, kind, kind.vector)
 
 
-@register_model(_Doubles)
-class _DoublesModel(models.PrimitiveModel):
-    def __init__(self, manager, kind):
-        super().__init__(manager, kind, VECTOR64)
-
-
-@register_model(_Mask)
+@register_model(Mask)
 class _MaskModel(models.PrimitiveModel):
     def __init__(self, manager, kind):
-        super().__init__(manager, kind, ir.VectorType(ir.IntType(1), WIDTH))
+        super().__init__(manager, kind, ir.VectorType(ir.IntType(1), kind.width))
+
+
+def integers(width, bits=32):
+    """LLVM's type of so many integers."""
+    return ir.VectorType(ir.IntType(bits), width)
+
+
+def pattern(lanes):
+    """The lanes that a shuffle takes, as LLVM needs them."""
+    lanes = list(lanes)
+    return ir.Constant(integers(len(lanes)), lanes)
 
 
 def _common(kinds):
-    """The type of an operation on `kinds`: float64 lanes if one of them is."""
-    return DOUBLES if DOUBLES in kinds else LANES
+    """The type of an operation on `kinds`: the lanes among them, float64 if there are such."""
+    lanes = [kind for kind in kinds if isinstance(kind, Lanes)]
+    return next((kind for kind in lanes if kind.number == types.float64), lanes[0] if lanes else LANES)
 
 
 def _broadcast(context, builder, value, kind, lanes):
     """`value` as `lanes`; a scalar is copied to every lane."""
     if kind == lanes:
         return value
-    vector, number = (VECTOR64, types.float64) if lanes == DOUBLES else (VECTOR32, types.float32)
-    scalar = context.cast(builder, value, kind, number)
-    first = builder.insert_element(ir.Constant(vector, ir.Undefined), scalar, ir.IntType(32)(0))
-    return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), ir.Constant(INTS32, [0] * WIDTH))
+    nothing = ir.Constant(lanes.vector, ir.Undefined)
+    first = builder.insert_element(nothing, context.cast(builder, value, kind, lanes.number), ir.IntType(32)(0))
+    return builder.shuffle_vector(first, nothing, pattern([0] * lanes.width))
 
 
-def _generator(emit, lanes):
+def _generator(emit):
     """A lowering that calls `emit(builder, *vectors)` on lanes or scalars."""
 
     def generate(context, builder, signature, values):
+        lanes = _common(signature.args)
         return emit(builder, *(_broadcast(context, builder, v, k, lanes) for v, k in zip(values, signature.args, strict=True)))
 
     return generate
 
 
-def lane_wise(emit, result=None):
-    """An intrinsic that calls `emit(builder, *vectors)` on lanes or scalars; `result`: its type if not the arguments'."""
-
-    def typed(*kinds):
-        lanes = _common(kinds)
-        return (result or lanes)(*kinds), _generator(emit, lanes)
-
-    return typed
+def lane_wise(emit):
+    """An intrinsic that calls `emit(builder, *vectors)` on lanes or scalars."""
+    return lambda *kinds: (_common(kinds)(*kinds), _generator(emit))
 
 
 def _call(name, builder, *vectors):
     """Call LLVM's intrinsic `name` on vectors."""
     kind = vectors[0].type
-    suffix = "f64" if kind == VECTOR64 else "f32"
+    suffix = "f64" if kind.element == ir.DoubleType() else "f32"
     signature = ir.FunctionType(kind, [kind] * len(vectors))
-    return builder.call(cgutils.get_or_insert_function(builder.module, signature, f"llvm.{name}.v{WIDTH}{suffix}"), vectors)
+    return builder.call(cgutils.get_or_insert_function(builder.module, signature, f"llvm.{name}.v{kind.count}{suffix}"), vectors)
 
 
-def _operator(symbol, emit, result=None):
-    """Define an operator for operands of which at least one is lanes; `result`: its type if not that of lanes.
+def _operator(symbol, emit, compares=False):
+    """Define an operator for operands of which at least one is lanes; its result is such lanes, or a mask if it compares.
 
     An `overload` would do the same, but numba compiles a function for each pair of types then: a third of all time to compile.
     """
@@ -108,38 +115,37 @@ def _operator(symbol, emit, result=None):
     @type_callable(symbol)
     def type_of(_context):
         def typer(*kinds):
-            return (result or _common(kinds)) if LANES in kinds or DOUBLES in kinds else None
+            if any(isinstance(kind, Lanes) for kind in kinds):
+                return Mask(_common(kinds).width) if compares else _common(kinds)
 
         return typer
 
-    for lanes in (LANES, DOUBLES):
-        for kinds in ((lanes, lanes), (lanes, types.Number), (types.Number, lanes)):
-            lower_builtin(symbol, *kinds)(_generator(emit, lanes))
+    for kinds in ((Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes)):
+        lower_builtin(symbol, *kinds)(_generator(emit))
 
 
 _operator(operator.add, lambda builder, a, b: builder.fadd(a, b))
 _operator(operator.sub, lambda builder, a, b: builder.fsub(a, b))
 _operator(operator.mul, lambda builder, a, b: builder.fmul(a, b))
 _operator(operator.truediv, lambda builder, a, b: builder.fdiv(a, b))
-_operator(operator.lt, lambda builder, a, b: builder.fcmp_ordered("<", a, b), MASK)
-_operator(operator.gt, lambda builder, a, b: builder.fcmp_ordered(">", a, b), MASK)
-_operator(operator.ge, lambda builder, a, b: builder.fcmp_ordered(">=", a, b), MASK)
-_operator(operator.le, lambda builder, a, b: builder.fcmp_ordered("<=", a, b), MASK)
+_operator(operator.lt, lambda builder, a, b: builder.fcmp_ordered("<", a, b), compares=True)
+_operator(operator.gt, lambda builder, a, b: builder.fcmp_ordered(">", a, b), compares=True)
+_operator(operator.ge, lambda builder, a, b: builder.fcmp_ordered(">=", a, b), compares=True)
+_operator(operator.le, lambda builder, a, b: builder.fcmp_ordered("<=", a, b), compares=True)
 
 
 @type_callable(operator.neg)
 def _type_of_negative(_context):
-    return lambda lanes: lanes if lanes in (LANES, DOUBLES) else None
+    return lambda lanes: lanes if isinstance(lanes, Lanes) else None
 
 
-for _lanes in (LANES, DOUBLES):
-    lower_builtin(operator.neg, _lanes)(_generator(lambda builder, lanes: builder.fsub(ir.Constant(lanes.type, None), lanes), _lanes))
+lower_builtin(operator.neg, Lanes)(_generator(lambda builder, lanes: builder.fneg(lanes)))
 
 
 @intrinsic
 def both(_context, first, second):
     """first and second, for two masks."""
-    return MASK(first, second), lambda context, builder, signature, values: builder.and_(*values)
+    return first(first, second), lambda context, builder, signature, values: builder.and_(*values)
 
 
 @intrinsic
@@ -147,7 +153,7 @@ def bits(_context, mask):
     """A mask as an integer: bit k is lane k."""
 
     def generate(context, builder, signature, values):
-        return builder.zext(builder.bitcast(values[0], ir.IntType(WIDTH)), ir.IntType(64))
+        return builder.zext(builder.bitcast(values[0], ir.IntType(mask.width)), ir.IntType(64))
 
     return types.int64(mask), generate
 
@@ -214,65 +220,103 @@ def broadcast(_context, value):
 
 def _plus(steps):
     """An emitter of lanes plus the constants `steps` [16]."""
-    constant = ir.Constant(VECTOR32, [float(step) for step in steps])
+    constant = ir.Constant(LANES.vector, [float(step) for step in steps])
     return lambda builder, start: builder.fadd(start, constant)
 
 
 @intrinsic
 def across(_context, start):
-    """start plus the column 0..3 of each lane, for lanes that are 4 x 4 pixels, row by row."""
+    """start, a number, plus the column 0..3 of each lane, for lanes that are 4 x 4 pixels, row by row."""
     return lane_wise(_plus(lane % 4 for lane in range(WIDTH)))(start)
 
 
 @intrinsic
 def down(_context, start):
-    """start plus the row 0..3 of each lane, for lanes that are 4 x 4 pixels, row by row."""
+    """start, a number, plus the row 0..3 of each lane, for lanes that are 4 x 4 pixels, row by row."""
     return lane_wise(_plus(lane // 4 for lane in range(WIDTH)))(start)
 
 
 @intrinsic
 def wide(_context, lanes):
-    """float32 as float64."""
-    return DOUBLES(lanes), lambda context, builder, signature, values: builder.fpext(values[0], VECTOR64)
+    """float32 as float64; any number of lanes."""
+    doubles = Lanes(types.float64, lanes.width)
+    return doubles(lanes), lambda context, builder, signature, values: builder.fpext(values[0], doubles.vector)
 
 
 @intrinsic
 def narrow(_context, doubles):
-    """float64 rounded to float32; infinite where float32 overflows."""
-    return LANES(doubles), lambda context, builder, signature, values: builder.fptrunc(values[0], VECTOR32)
+    """float64 rounded to float32, infinite where float32 overflows; any number of lanes."""
+    lanes = Lanes(types.float32, doubles.width)
+    return lanes(doubles), lambda context, builder, signature, values: builder.fptrunc(values[0], lanes.vector)
 
 
 @intrinsic
 def total(_context, lanes):
-    """The sum of all lanes, adding halves: the same order on every processor."""
+    """The sum of any number of lanes, adding halves: the same order on every processor."""
 
     def generate(context, builder, signature, values):
-        value, width = values[0], WIDTH
+        value, width = values[0], lanes.width
         while width > 1:
             width //= 2
-            halves = [ir.Constant(ir.VectorType(ir.IntType(32), width), list(range(at, at + width))) for at in (0, width)]
-            value = builder.fadd(*(builder.shuffle_vector(value, value, half) for half in halves))
+            value = builder.fadd(*_halves(builder, value, width))
         return builder.extract_element(value, ir.IntType(32)(0))
 
-    return types.float32(lanes), generate
+    return lanes.number(lanes), generate
+
+
+def _halves(builder, value, width):
+    """The first `width` lanes and the next as many."""
+    return [builder.shuffle_vector(value, value, pattern(range(at, at + width))) for at in (0, width)]
+
+
+# Sums over many sets of lanes have half as many lanes: 9 sums are more than the registers of most processors hold as whole ones.
+HALF = Lanes(types.float32, WIDTH // 2)
 
 
 @intrinsic
-def totals(_context, lanes):
-    """The sums of all lanes of each of 8 lanes, in the first half of lanes; in the same order as `total`, in a third of the instructions."""
+def zero_sum(_context):
+    """A sum to begin with."""
+    return HALF(), lambda context, builder, signature, values: ir.Constant(HALF.vector, None)
+
+
+@intrinsic
+def summed(_context, sums, lanes):
+    """A sum plus the halves of lanes."""
 
     def generate(context, builder, signature, values):
-        vectors, segment = cgutils.unpack_tuple(builder, values[0], 8), WIDTH
+        first, second = _halves(builder, values[1], HALF.width)
+        return builder.fadd(builder.fadd(values[0], first), second)
+
+    return HALF(sums, lanes), generate
+
+
+@intrinsic
+def summed_product(_context, sums, one, other):
+    """A sum plus the halves of the product of two sets of lanes."""
+
+    def generate(context, builder, signature, values):
+        (one_first, one_second), (other_first, other_second) = (_halves(builder, value, HALF.width) for value in values[1:])
+        return _call("fmuladd", builder, one_second, other_second, _call("fmuladd", builder, one_first, other_first, values[0]))
+
+    return HALF(sums, one, other), generate
+
+
+@intrinsic
+def totals(_context, sums):
+    """The totals of 8 sums, as 8 lanes; in the same order as `total`, in a third of the instructions."""
+
+    def generate(context, builder, signature, values):
+        vectors, segment = cgutils.unpack_tuple(builder, values[0], HALF.width), HALF.width
         while len(vectors) > 1:  # two vectors of segments become one of segments half as long
             pairs = zip(vectors[::2], vectors[1::2], strict=True)
             vectors, segment = [_add_halves(builder, *pair, segment) for pair in pairs], segment // 2
-        return _add_halves(builder, vectors[0], vectors[0], segment)
+        return vectors[0]
 
-    return LANES(lanes), generate
+    return HALF(sums), generate
 
 
 def _add_halves(builder, first, second, segment):
     """Two vectors of segments as one, in which each segment is the sum of its halves."""
-    starts = range(0, 2 * WIDTH, segment)
+    starts = range(0, 2 * HALF.width, segment)
     firsts, seconds = ([start + half + k for start in starts for k in range(segment // 2)] for half in (0, segment // 2))
-    return builder.fadd(*(builder.shuffle_vector(first, second, ir.Constant(INTS32, half)) for half in (firsts, seconds)))
+    return builder.fadd(*(builder.shuffle_vector(first, second, pattern(half)) for half in (firsts, seconds)))

@@ -8,7 +8,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from mipmap_plugin.backends.cpu_kernels.lanes import DOUBLES, INTS32, INTS64, LANES, VECTOR32, VECTOR64, WIDTH
+from mipmap_plugin.backends.cpu_kernels.lanes import DOUBLES, LANES, WIDTH, integers
 
 # Bytes of a cache line.
 CACHE_LINE = 64
@@ -60,9 +60,9 @@ def scratch(count, number):
     return zeros
 
 
-def _address(context, builder, kind, array, index):
+def _address(context, builder, kind, array, index, vector):
+    """Where in an array, or from a pointer on, such a vector lies."""
     data = array if isinstance(kind, types.CPointer) else context.make_array(kind)(context, builder, array).data
-    vector = VECTOR64 if kind.dtype == types.float64 else VECTOR32
     return builder.bitcast(builder.gep(data, [index]), vector.as_pointer())
 
 
@@ -72,18 +72,19 @@ def load(_context, array, index):
 
     def generate(context, builder, signature, values):
         index = context.cast(builder, values[1], signature.args[1], types.intp)
-        return builder.load(_address(context, builder, signature.args[0], values[0], index), align=4)
+        return builder.load(_address(context, builder, array, values[0], index, lanes.vector), align=4)
 
-    return (DOUBLES if array.dtype == types.float64 else LANES)(array, index), generate
+    lanes = DOUBLES if array.dtype == types.float64 else LANES
+    return lanes(array, index), generate
 
 
 @intrinsic
 def store(_context, array, index, lanes):
-    """array[index : index + 16] = lanes."""
+    """As many numbers as there are lanes, from array[index] on, = lanes."""
 
     def generate(context, builder, signature, values):
         index = context.cast(builder, values[1], signature.args[1], types.intp)
-        builder.store(values[2], _address(context, builder, signature.args[0], values[0], index), align=4)
+        builder.store(values[2], _address(context, builder, array, values[0], index, lanes.vector), align=4)
         return context.get_dummy_value()
 
     return types.void(array, index, lanes), generate
@@ -91,28 +92,16 @@ def store(_context, array, index, lanes):
 
 @intrinsic
 def store_integers(_context, array, index, lanes):
-    """array[index : index + 16] = lanes, for a pointer to int32; what is no integer of 32 bits becomes any."""
+    """As `store`, for a pointer to int32; what is no integer of 32 bits becomes any."""
 
     def generate(context, builder, signature, values):
         index = context.cast(builder, values[1], signature.args[1], types.intp)
-        address = builder.bitcast(builder.gep(values[0], [index]), INTS32.as_pointer())
-        builder.store(builder.fptosi(values[2], INTS32), address, align=4)
+        ints = integers(lanes.width)
+        address = builder.bitcast(builder.gep(values[0], [index]), ints.as_pointer())
+        builder.store(builder.fptosi(values[2], ints), address, align=4)
         return context.get_dummy_value()
 
     return types.void(array, index, lanes), generate
-
-
-@intrinsic
-def store_half(_context, array, lanes):
-    """array[0 : 8] = the first half of float32 lanes, for a pointer."""
-
-    def generate(context, builder, signature, values):
-        half = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH // 2), list(range(WIDTH // 2)))
-        first = builder.shuffle_vector(values[1], values[1], half)
-        builder.store(first, builder.bitcast(values[0], first.type.as_pointer()), align=4)
-        return context.get_dummy_value()
-
-    return types.void(array, lanes), generate
 
 
 @intrinsic
@@ -124,13 +113,14 @@ def store_bit_ranges(_context, array, begins, ends):
 
     def generate(context, builder, signature, values):
         begins, ends = (cgutils.unpack_tuple(builder, value, 4) for value in values[1:])
-        one, word = (ir.Constant(INTS32, [number] * WIDTH) for number in (1, 16))
+        short, long = integers(WIDTH), integers(WIDTH, 64)
+        one, word = (ir.Constant(short, [number] * WIDTH) for number in (1, 16))
         first, second, third, fourth = (
-            builder.sub(*(builder.shl(one, builder.fptosi(edge, INTS32)) for edge in edges)) for edges in zip(ends, begins, strict=True)
+            builder.sub(*(builder.shl(one, builder.fptosi(edge, short)) for edge in edges)) for edges in zip(ends, begins, strict=True)
         )
         low, high = (builder.or_(even, builder.shl(odd, word)) for even, odd in ((first, second), (third, fourth)))
-        integers = builder.or_(builder.zext(low, INTS64), builder.shl(builder.zext(high, INTS64), ir.Constant(INTS64, [32] * WIDTH)))
-        builder.store(integers, builder.bitcast(values[0], INTS64.as_pointer()), align=8)
+        words = builder.or_(builder.zext(low, long), builder.shl(builder.zext(high, long), ir.Constant(long, [32] * WIDTH)))
+        builder.store(words, builder.bitcast(values[0], long.as_pointer()), align=8)
         return context.get_dummy_value()
 
     return types.void(array, begins, ends), generate

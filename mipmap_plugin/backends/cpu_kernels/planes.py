@@ -12,7 +12,7 @@ from numba import types
 
 from mipmap_plugin.backends.cpu_kernels import inner, layout
 from mipmap_plugin.backends.cpu_kernels.binning import TILE_HEIGHT, TILE_WIDTH
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, across, bits, both, down, fma, minimum, select
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, absolute, across, bits, both, down, fma, minimum, select
 from mipmap_plugin.backends.cpu_kernels.memory import load, scratch, store
 
 # px: the width and height of a patch.
@@ -22,9 +22,6 @@ PATCH = 4
 PATCH_COLUMNS = TILE_WIDTH // PATCH
 PATCHES = PATCH_COLUMNS * TILE_HEIGHT // PATCH
 PLANE = PATCHES * WIDTH
-
-# All pixels of a patch.
-ALL = (1 << WIDTH) - 1
 
 # Offsets of planes in a tile's state: red, green and blue (in the backward pass dLoss/dimage), then
 TRANSMITTANCE = 3 * PLANE  # behind the splats so far; negative: the pixel stopped
@@ -61,9 +58,10 @@ def blend(alpha, bright, limits, color, n, at, state):
     store(state, at, fma(weight, color[0], load(state, at)))
     store(state, PLANE + at, fma(weight, color[1], load(state, PLANE + at)))
     store(state, 2 * PLANE + at, fma(weight, color[2], load(state, 2 * PLANE + at)))
-    store(state, TRANSMITTANCE + at, select(is_open, after, minimum(before, 0 - before)))
-    if bits(is_open) != ALL:
-        store(state, STOPS + at, select(both(before >= 0, after < min_transmittance), n, load(state, STOPS + at)))
+    store(state, TRANSMITTANCE + at, select(is_open, after, -absolute(before)))
+    stops = both(before >= 0, after < min_transmittance)
+    if bits(stops) != 0:
+        store(state, STOPS + at, select(stops, n, load(state, STOPS + at)))
 
 
 @inner

@@ -9,7 +9,12 @@ from llvmlite import ir
 from numba.extending import intrinsic
 
 from mipmap_plugin.backends.cpu_kernels import inner
-from mipmap_plugin.backends.cpu_kernels.lanes import INTS32, INTS64, VECTOR32, VECTOR64, WIDTH, fma, lane_wise, maximum, narrow, select, wide
+from mipmap_plugin.backends.cpu_kernels.lanes import fma, integers, lane_wise, maximum, narrow, select, wide
+
+
+def _all(ints, number):
+    """The same integer in every lane."""
+    return ir.Constant(ints, [number] * ints.count)
 
 
 @intrinsic
@@ -17,9 +22,9 @@ def _add_to_exponent(_context, lanes, rounded):
     """lanes · 2^n, with n in the low bits of `rounded` as in `exp2`."""
 
     def emit(builder, lanes, rounded):
-        shift = ir.Constant(INTS32, [23] * WIDTH)
-        bits = builder.add(builder.bitcast(lanes, INTS32), builder.shl(builder.bitcast(rounded, INTS32), shift))
-        return builder.bitcast(bits, VECTOR32)
+        ints = integers(lanes.type.count)
+        bits = builder.add(builder.bitcast(lanes, ints), builder.shl(builder.bitcast(rounded, ints), _all(ints, 23)))
+        return builder.bitcast(bits, lanes.type)
 
     return lane_wise(emit)(lanes, rounded)
 
@@ -46,8 +51,9 @@ def _exponent(_context, lanes):
     """The exponents of positive float64."""
 
     def emit(builder, lanes):
-        bits = builder.lshr(builder.bitcast(lanes, INTS64), ir.Constant(INTS64, [52] * WIDTH))
-        return builder.sitofp(builder.sub(bits, ir.Constant(INTS64, [1023] * WIDTH)), VECTOR64)
+        ints = integers(lanes.type.count, 64)
+        bits = builder.lshr(builder.bitcast(lanes, ints), _all(ints, 52))
+        return builder.sitofp(builder.sub(bits, _all(ints, 1023)), lanes.type)
 
     return lane_wise(emit)(lanes)
 
@@ -57,8 +63,9 @@ def _mantissa(_context, lanes):
     """The mantissas of positive float64, 1 .. 2."""
 
     def emit(builder, lanes):
-        digits = builder.and_(builder.bitcast(lanes, INTS64), ir.Constant(INTS64, [(1 << 52) - 1] * WIDTH))
-        return builder.bitcast(builder.or_(digits, ir.Constant(INTS64, [1023 << 52] * WIDTH)), VECTOR64)
+        ints = integers(lanes.type.count, 64)
+        digits = builder.and_(builder.bitcast(lanes, ints), _all(ints, (1 << 52) - 1))
+        return builder.bitcast(builder.or_(digits, _all(ints, 1023 << 52)), lanes.type)
 
     return lane_wise(emit)(lanes)
 

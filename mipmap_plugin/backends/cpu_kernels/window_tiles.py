@@ -14,7 +14,7 @@ from mipmap_plugin.backends.cpu_kernels import inner, kernel, layout, windows
 from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA
 from mipmap_plugin.backends.cpu_kernels.compositing import fill_range, init_tile, tile_box, unfinished_patches, write_tile
 from mipmap_plugin.backends.cpu_kernels.compositing_back import init_tile_back, write_sums
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, broadcast, fma, lowest_bit, select
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, lowest_bit, select, summed, summed_product, zero_sum
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, row_of, scratch, store
 from mipmap_plugin.backends.cpu_kernels.patches import BATCH, find_patches, new_found
 from mipmap_plugin.backends.cpu_kernels.planes import PATCHES, PLANE, STATE_SIZE, STOPS, TRANSMITTANCE, blend, distances, unblend
@@ -163,7 +163,7 @@ def undraw_splat(splat, n, box, state, record, visits, grads):
     """Remove a splat, the n-th of its tile, and write its gradients. visits: the first of its visits, and the first of the next splat's."""
     stored, positions, _ = record
     color, shape = (splat[layout.RED], splat[layout.GREEN], splat[layout.BLUE]), windows.splat_parameters(splat)
-    sum_1 = sum_u = sum_v = sum_log_long = sum_log_short = sum_angle = sum_red = sum_green = sum_blue = broadcast(0)
+    sum_1 = sum_u = sum_v = sum_log_long = sum_log_short = sum_angle = sum_red = sum_green = sum_blue = zero_sum()
     for visit in range(visits[0], visits[1]):
         at, window = positions[visit], load_windows(stored, visit * VISIT_SIZE, WIDTH)
         dx, dy = distances(splat, at // WIDTH, box)
@@ -175,9 +175,11 @@ def undraw_splat(splat, n, box, state, record, visits, grads):
         d_window = load_windows(state, WINDOWS + at, PLANE)
         d_before, s, slopes = windows.grad_windows_behind(shape, alpha, s, integral, behind, windows.grad_clamp_window(after, d_window))
         store_windows(state, WINDOWS + at, PLANE, select_windows(visible, d_before, d_window))
-        sum_1, sum_u, sum_v = sum_1 + select(visible, s, 0), sum_u + select(visible, slopes[0], 0), sum_v + select(visible, slopes[1], 0)
-        sum_log_long, sum_log_short = sum_log_long + select(visible, slopes[2], 0), sum_log_short + select(visible, slopes[3], 0)
-        sum_angle = sum_angle + select(visible, slopes[4], 0)
-        sum_red, sum_green, sum_blue = fma(weight, d_red, sum_red), fma(weight, d_green, sum_green), fma(weight, d_blue, sum_blue)
+        sum_1, sum_angle = summed(sum_1, select(visible, s, 0)), summed(sum_angle, select(visible, slopes[4], 0))
+        sum_u, sum_v = summed(sum_u, select(visible, slopes[0], 0)), summed(sum_v, select(visible, slopes[1], 0))
+        sum_log_long = summed(sum_log_long, select(visible, slopes[2], 0))
+        sum_log_short = summed(sum_log_short, select(visible, slopes[3], 0))
+        sum_red, sum_green = summed_product(sum_red, weight, d_red), summed_product(sum_green, weight, d_green)
+        sum_blue = summed_product(sum_blue, weight, d_blue)
     sum_u, sum_v = sum_u * (1 / shape[3]), sum_v * (1 / shape[4])
     write_sums((sum_1, sum_u, sum_v, sum_log_long, sum_log_short, sum_angle, sum_red, sum_green), sum_blue, grads)
