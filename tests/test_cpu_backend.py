@@ -268,13 +268,13 @@ def test_functions_in_lanes_of_float64(name):
     import numpy as np
 
     from mipmap_plugin.backends.cpu_kernels import kernel, powers
-    from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH
+    from mipmap_plugin.backends.cpu_kernels.lanes import PART
     from mipmap_plugin.backends.cpu_kernels.memory import load, store
 
     function = getattr(powers, name)
 
     def values(arguments, out):
-        for at in range(0, len(arguments), WIDTH):
+        for at in range(0, len(arguments), PART):
             store(out, at, function(load(arguments, at)))
 
     arguments = np.exp(np.linspace(-80, 80, 1 << 16))

@@ -1,4 +1,4 @@
-"""Which tiles 16 splats touch: exact for the pixel rows and the extent in x of the ellipse alpha >= 1/255."""
+"""Which tiles a part of 16 splats touches: exact for the pixel rows and the extent in x of the ellipse alpha >= 1/255."""
 
 # numba redefines calls and operators.
 # mypy: ignore-errors
@@ -6,7 +6,7 @@
 import math
 
 from mipmap_plugin.backends.cpu_kernels import inner, kernel, layout
-from mipmap_plugin.backends.cpu_kernels.blocks import get, put
+from mipmap_plugin.backends.cpu_kernels.blocks import get_part, put
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, ceil, floor, lowest_bit, maximum, minimum, narrow, select, sqrt, wide
 from mipmap_plugin.render_settings import MIN_ALPHA
 
@@ -30,7 +30,7 @@ def tile_grid(width, height):
 @inner
 def pixel_rows(block, height):
     """The first and last pixel row that each splat touches; if it touches none, the last is less than the first."""
-    y, reach = wide(get(block, layout.Y)) - 0.5, wide(get(block, layout.REACH_Y)) + SLACK
+    y, reach = wide(get_part(block, layout.Y)) - 0.5, wide(get_part(block, layout.REACH_Y)) + SLACK
     return integers_between(y - reach, y + reach, height - 1)
 
 
@@ -43,15 +43,15 @@ def integers_between(low, high, last):
 @inner
 def half_width(block, dy):
     """px from the ellipse's center line to where alpha falls below 1/255, `dy` px from the center."""
-    margin = wide(get(block, layout.PEAK)) - LOG_MIN_ALPHA - wide(get(block, layout.FALL_Y)) * dy * dy
-    return wide(sqrt(narrow(maximum(margin, 0)) * get(block, layout.PER_FALL_X))) + SLACK
+    margin = wide(get_part(block, layout.PEAK)) - LOG_MIN_ALPHA - wide(get_part(block, layout.FALL_Y)) * dy * dy
+    return wide(sqrt(narrow(maximum(margin, 0)) * get_part(block, layout.PER_FALL_X))) + SLACK
 
 
 @inner
 def tile_x_range(block, first, last, width):
     """The first and last tile in x that each splat touches between the pixel rows first..last; none: the last is less than the first."""
-    y, rightmost_dy = wide(get(block, layout.Y)), wide(get(block, layout.RIGHTMOST_DY))
-    x, shear = wide(get(block, layout.X)) - 0.5, wide(get(block, layout.SHEAR))
+    y, rightmost_dy = wide(get_part(block, layout.Y)), wide(get_part(block, layout.RIGHTMOST_DY))
+    x, shear = wide(get_part(block, layout.X)) - 0.5, wide(get_part(block, layout.SHEAR))
     above, below = first + 0.5 - y, last + 0.5 - y
     dy_of_right, dy_of_left = minimum(maximum(rightmost_dy, above), below), minimum(maximum(-rightmost_dy, above), below)
     right = x + shear * dy_of_right + half_width(block, dy_of_right)
@@ -63,7 +63,7 @@ def tile_x_range(block, first, last, width):
 
 @inner
 def tiles_in_row(first, last, tile_y, block, width):
-    """For 16 splats that touch the pixel rows first..last: which of them touch the tile row `tile_y`, and their first and last tile in it."""
+    """For splats that touch the pixel rows first..last: which of them touch the tile row `tile_y`, and their first and last tile in it."""
     first_x, last_x = tile_x_range(block, maximum(first, tile_y * TILE_HEIGHT), minimum(last, tile_y * TILE_HEIGHT + (TILE_HEIGHT - 1)), width)
     return both(both(tile_y * TILE_HEIGHT <= last, first <= last), first_x <= last_x), first_x, last_x
 
@@ -84,7 +84,7 @@ def count_tiles(block, drawn, width, height):
 
 @inner
 def write_tiles(block, spans, drawn, slots, width, height, tiles, counts):
-    """Write the tiles of the splats whose bit is set in `drawn`, from their next `slots` [16] on, and count them per tile. spans: [32]."""
+    """Write the tiles of the splats whose bit is set in `drawn`, from their next `slots` on, and count them per tile. spans: two fields."""
     tiles_x = tile_grid(width, height)[0]
     first, last = pixel_rows(block, height)
     tile_y = floor(first * (1 / TILE_HEIGHT))

@@ -8,9 +8,10 @@ import numpy as np
 from mipmap_plugin.backends.cpu_kernels import inner, layout
 from mipmap_plugin.backends.cpu_kernels.blocks import get, put
 from mipmap_plugin.backends.cpu_kernels.columns import apart, load_three
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, absolute, both, lowest_bit, maximum, minimum, total
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, absolute, both, lowest_bit, maximum, minimum
 from mipmap_plugin.backends.cpu_kernels.layout import HUGE
 from mipmap_plugin.backends.cpu_kernels.memory import load
+from mipmap_plugin.backends.cpu_kernels.sums import total
 
 # The least positive color, and the factor that makes the largest color slightly less, in float32.
 MIN_COLOR, BELOW_MAX = 1e-30, 1 - 1e-7

@@ -6,7 +6,7 @@
 from mipmap_plugin.backends.cpu_kernels import inner, integrals, kernel, layout
 from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA
 from mipmap_plugin.backends.cpu_kernels.compositing import fill_range, log_alpha, tile_box
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, fma, lowest_bit, summed, summed_product, total, totals, zero_sum
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, fma, lowest_bit
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, row_of, store
 from mipmap_plugin.backends.cpu_kernels.patches import BATCH, prefetch_rows
 from mipmap_plugin.backends.cpu_kernels.planes import (
@@ -24,6 +24,7 @@ from mipmap_plugin.backends.cpu_kernels.planes import (
     unblend,
 )
 from mipmap_plugin.backends.cpu_kernels.powers import exp2
+from mipmap_plugin.backends.cpu_kernels.sums import summed, summed_product, total, totals, zero_sum
 from mipmap_plugin.render_settings import MIN_ALPHA
 
 

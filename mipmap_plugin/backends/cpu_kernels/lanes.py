@@ -4,7 +4,7 @@ Plain loops are vectorized only when LLVM decides to, and a loop that silently i
 `a + b` on lanes is one vector addition on every processor. Scalars mix in freely and are broadcast to all lanes; float32 and float64 mix
 only through `wide` and `narrow`. Nothing is reassociated, so equal inputs give equal bits.
 
-There are WIDTH lanes, unless a docstring says otherwise.
+There are WIDTH lanes of float32, and PART of float64, unless a docstring says otherwise.
 """
 
 # numba redefines calls and operators.
@@ -14,11 +14,15 @@ import operator
 from functools import partial
 
 from llvmlite import ir
+from llvmlite.binding import get_host_cpu_features
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
 
 WIDTH = 16
+
+# Splats whose geometry is computed at a time: as many float64 as a register holds. Of more the numbers do not fit into all registers.
+PART = 8 if get_host_cpu_features().get("avx512f") else 4
 
 
 class Lanes(types.Type):
@@ -42,7 +46,7 @@ class Mask(types.Type):
         super().__init__(f"boolx{width}")
 
 
-LANES, DOUBLES = Lanes(types.float32, WIDTH), Lanes(types.float64, WIDTH)
+LANES = Lanes(types.float32, WIDTH)
 
 
 @register_model(Lanes)
@@ -98,7 +102,7 @@ def lane_wise(emit):
     return lambda *kinds: (_common(kinds)(*kinds), _generator(emit))
 
 
-def _call(name, builder, *vectors):
+def call(name, builder, *vectors):
     """Call LLVM's intrinsic `name` on vectors."""
     kind = vectors[0].type
     suffix = "f64" if kind.element == ir.DoubleType() else "f32"
@@ -179,7 +183,7 @@ def select(_context, mask, yes, no):
 @intrinsic
 def fma(_context, a, b, c):
     """a·b + c, rounded once where the processor has such an instruction."""
-    return lane_wise(partial(_call, "fmuladd"))(a, b, c)
+    return lane_wise(partial(call, "fmuladd"))(a, b, c)
 
 
 @intrinsic
@@ -194,22 +198,22 @@ def maximum(_context, a, b):
 
 @intrinsic
 def absolute(_context, a):
-    return lane_wise(partial(_call, "fabs"))(a)
+    return lane_wise(partial(call, "fabs"))(a)
 
 
 @intrinsic
 def sqrt(_context, a):
-    return lane_wise(partial(_call, "sqrt"))(a)
+    return lane_wise(partial(call, "sqrt"))(a)
 
 
 @intrinsic
 def floor(_context, a):
-    return lane_wise(partial(_call, "floor"))(a)
+    return lane_wise(partial(call, "floor"))(a)
 
 
 @intrinsic
 def ceil(_context, a):
-    return lane_wise(partial(_call, "ceil"))(a)
+    return lane_wise(partial(call, "ceil"))(a)
 
 
 @intrinsic
@@ -248,75 +252,3 @@ def narrow(_context, doubles):
     """float64 rounded to float32, infinite where float32 overflows; any number of lanes."""
     lanes = Lanes(types.float32, doubles.width)
     return lanes(doubles), lambda context, builder, signature, values: builder.fptrunc(values[0], lanes.vector)
-
-
-@intrinsic
-def total(_context, lanes):
-    """The sum of any number of lanes, adding halves: the same order on every processor."""
-
-    def generate(context, builder, signature, values):
-        value, width = values[0], lanes.width
-        while width > 1:
-            width //= 2
-            value = builder.fadd(*_halves(builder, value, width))
-        return builder.extract_element(value, ir.IntType(32)(0))
-
-    return lanes.number(lanes), generate
-
-
-def _halves(builder, value, width):
-    """The first `width` lanes and the next as many."""
-    return [builder.shuffle_vector(value, value, pattern(range(at, at + width))) for at in (0, width)]
-
-
-# Sums over many sets of lanes have half as many lanes: 9 sums are more than the registers of most processors hold as whole ones.
-HALF = Lanes(types.float32, WIDTH // 2)
-
-
-@intrinsic
-def zero_sum(_context):
-    """A sum to begin with."""
-    return HALF(), lambda context, builder, signature, values: ir.Constant(HALF.vector, None)
-
-
-@intrinsic
-def summed(_context, sums, lanes):
-    """A sum plus the halves of lanes."""
-
-    def generate(context, builder, signature, values):
-        first, second = _halves(builder, values[1], HALF.width)
-        return builder.fadd(builder.fadd(values[0], first), second)
-
-    return HALF(sums, lanes), generate
-
-
-@intrinsic
-def summed_product(_context, sums, one, other):
-    """A sum plus the halves of the product of two sets of lanes."""
-
-    def generate(context, builder, signature, values):
-        (one_first, one_second), (other_first, other_second) = (_halves(builder, value, HALF.width) for value in values[1:])
-        return _call("fmuladd", builder, one_second, other_second, _call("fmuladd", builder, one_first, other_first, values[0]))
-
-    return HALF(sums, one, other), generate
-
-
-@intrinsic
-def totals(_context, sums):
-    """The totals of 8 sums, as 8 lanes; in the same order as `total`, in a third of the instructions."""
-
-    def generate(context, builder, signature, values):
-        vectors, segment = cgutils.unpack_tuple(builder, values[0], HALF.width), HALF.width
-        while len(vectors) > 1:  # two vectors of segments become one of segments half as long
-            pairs = zip(vectors[::2], vectors[1::2], strict=True)
-            vectors, segment = [_add_halves(builder, *pair, segment) for pair in pairs], segment // 2
-        return vectors[0]
-
-    return HALF(sums), generate
-
-
-def _add_halves(builder, first, second, segment):
-    """Two vectors of segments as one, in which each segment is the sum of its halves."""
-    starts = range(0, 2 * HALF.width, segment)
-    firsts, seconds = ([start + half + k for start in starts for k in range(segment // 2)] for half in (0, segment // 2))
-    return builder.fadd(*(builder.shuffle_vector(first, second, pattern(half)) for half in (firsts, seconds)))

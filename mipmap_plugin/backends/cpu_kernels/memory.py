@@ -8,7 +8,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from mipmap_plugin.backends.cpu_kernels.lanes import DOUBLES, LANES, WIDTH, integers
+from mipmap_plugin.backends.cpu_kernels.lanes import PART, WIDTH, Lanes, integers
 
 # Bytes of a cache line.
 CACHE_LINE = 64
@@ -66,16 +66,34 @@ def _address(context, builder, kind, array, index, vector):
     return builder.bitcast(builder.gep(data, [index]), vector.as_pointer())
 
 
+def _loader(widths):
+    """An intrinsic that loads the numbers from array[index] on of a contiguous array [n], or from a pointer: so many float32 or float64."""
+
+    def typed(_context, array, index):
+        lanes = Lanes(array.dtype, widths[array.dtype])
+
+        def generate(context, builder, signature, values):
+            index = context.cast(builder, values[1], signature.args[1], types.intp)
+            return builder.load(_address(context, builder, array, values[0], index, lanes.vector), align=4)
+
+        return lanes(array, index), generate
+
+    return intrinsic(typed)
+
+
+# Bounds are not checked. `load_part`: of float32, for the geometry of a part; `load_whole`: of float64, the numbers of all parts.
+load = _loader({types.float32: WIDTH, types.float64: PART})
+load_part, load_whole = _loader({types.float32: PART}), _loader({types.float64: WIDTH})
+
+
 @intrinsic
-def load(_context, array, index):
-    """array[index : index + 16] of a contiguous array [n] of float32 or float64, or of a pointer. Bounds are not checked."""
+def beyond(_context, array, count):
+    """A pointer `count` numbers beyond another."""
 
     def generate(context, builder, signature, values):
-        index = context.cast(builder, values[1], signature.args[1], types.intp)
-        return builder.load(_address(context, builder, array, values[0], index, lanes.vector), align=4)
+        return builder.gep(values[0], [context.cast(builder, values[1], signature.args[1], types.intp)])
 
-    lanes = DOUBLES if array.dtype == types.float64 else LANES
-    return lanes(array, index), generate
+    return array(array, count), generate
 
 
 @intrinsic

@@ -1,4 +1,7 @@
-"""Splats in the world to rows of the splat table, 16 at a time. Geometry is in float64: float32 would lose needles and distant splats."""
+"""Splats in the world to rows of the splat table, 16 at a time. Geometry is in float64: float32 would lose needles and distant splats.
+
+It is computed part by part of the 16 (`lanes.PART`).
+"""
 
 # numba redefines calls and operators.
 # mypy: ignore-errors
@@ -12,9 +15,9 @@ from mipmap_plugin.backends.cpu_kernels.binning import count_tiles
 from mipmap_plugin.backends.cpu_kernels.blocks import get, get_vector, put, put_vector
 from mipmap_plugin.backends.cpu_kernels.colors import clamp_colors, fill_colors
 from mipmap_plugin.backends.cpu_kernels.columns import apart, load_four, load_three, transpose
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, absolute, bits, both, broadcast, lowest_bit, maximum, narrow, select, sqrt, wide
+from mipmap_plugin.backends.cpu_kernels.lanes import PART, WIDTH, absolute, bits, both, lowest_bit, maximum, narrow, select, sqrt, wide
 from mipmap_plugin.backends.cpu_kernels.layout import HUGE
-from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, scratch, store, store_integers
+from mipmap_plugin.backends.cpu_kernels.memory import beyond, load, pointer, scratch, store, store_integers
 from mipmap_plugin.backends.cpu_kernels.powers import log2
 from mipmap_plugin.backends.cpu_kernels.records import OVER_PIXEL
 from mipmap_plugin.backends.cpu_kernels.tuples import apply, dot, minus, plus, times
@@ -27,7 +30,11 @@ HALF_LOG2E = 0.5 / math.log(2)
 MEAN, OPACITY, COVARIANCE, QUAT, SCALE = 0, 3, 4, 4, 8
 WORLD_FIELDS = 13
 
-new_world = scratch(WORLD_FIELDS * WIDTH, types.float64)
+# Fields of a block of what is found part by part, float32: what `store_places` writes, and unit vectors from the eye.
+DEPTH, COUNT, FIRST_TILE, DIRECTION = 0, 1, 2, 3
+SEEN_FIELDS = 6
+
+new_world, new_seen = scratch(WORLD_FIELDS * WIDTH, types.float64), scratch(SEEN_FIELDS * WIDTH, types.float32)
 new_block, new_bands = scratch(layout.SPLAT_FIELDS * WIDTH, types.float32), scratch(harmonics.MAX_BANDS * WIDTH, types.float32)
 
 
@@ -40,7 +47,7 @@ def project(start, stop, flags, view, splats, table, depths, counts, first_tiles
     covariances, integrated, reshaped, _, fourth, third = flags
     arrays, sh, rows, stride = pointers(splats), pointer(splats.sh), pointer(table), 3 * splats.sh.shape[1]
     outputs = pointer(depths), pointer(counts), pointer(first_tiles)
-    world, block, row_of, bands, bands_of = new_world(), new_block(), new_block(), new_bands(), new_bands()
+    world, seen, block, row_of, bands, bands_of = new_world(), new_seen(), new_block(), new_block(), new_bands(), new_bands()
     for first in range(start, stop, WIDTH):
         size = min(WIDTH, stop - first)
         if size == WIDTH and covariances is None:
@@ -48,22 +55,34 @@ def project(start, stop, flags, view, splats, table, depths, counts, first_tiles
         else:
             for lane in range(size):
                 load_splat(first + lane, lane, arrays, covariances, world)
-        p = plus(apply(view.rotation, get_vector(world, MEAN)), view.translation)
-        jac = ellipses.jacobian(view, p)
-        shape = project_any(jac, covariances, world)
-        drawn = both(p[2] > view.near_plane, fill_shape(view, integrated, reshaped, p, shape, get(world, OPACITY), block))
-        count, first_tile = count_tiles(block, drawn, view.width, view.height)
-        visible = bits(count > 0) & ((1 << size) - 1)
+        visible = 0
+        for part in range(0, size, PART):
+            visible |= project_part(view, covariances, integrated, reshaped, beyond(world, part), beyond(block, part), beyond(seen, part)) << part
+        visible &= (1 << size) - 1
         if visible != 0:
-            harmonics.basis(narrowed(view_direction(view, get_vector(world, MEAN))[0]), view.sh_degree, fourth, bands)
+            harmonics.basis(get_vector(seen, DIRECTION), view.sh_degree, fourth, bands)
             if third is not None:
                 transpose(bands, bands_of)
             fill_colors(visible, first * stride, stride, view, third, sh, bands, bands_of, block)
             finite = clamp_colors(view, block)
-            count = select(finite, count, 0)
+            put(seen, COUNT, select(finite, get(seen, COUNT), 0))
             transpose(block, row_of)
             store_rows_of(visible & bits(finite), first, row_of, rows)
-        store_places(first, size, sqrt(dot(p, p)) if view.radial else p[2], count, first_tile, outputs, world)
+        store_places(first, size, seen, outputs)
+
+
+@inner
+def project_part(view, covariances, integrated, reshaped, world, block, seen):
+    """Fill a part of the blocks `block`, without colors, and `seen`; returns a bit for each splat that touches a tile."""
+    mean = get_vector(world, MEAN)
+    p = plus(apply(view.rotation, mean), view.translation)
+    shape = project_any(ellipses.jacobian(view, p), covariances, world)
+    drawn = both(p[2] > view.near_plane, fill_shape(view, integrated, reshaped, p, shape, get(world, OPACITY), block))
+    count, first_tile = count_tiles(block, drawn, view.width, view.height)
+    depth = sqrt(dot(p, p)) if view.radial else p[2]
+    put_vector(seen, DEPTH, (narrow(depth), narrow(count), narrow(first_tile)))
+    put_vector(seen, DIRECTION, narrowed(view_direction(view, mean)[0]))
+    return bits(count > 0)
 
 
 @inner
@@ -76,18 +95,17 @@ def store_rows_of(shown, first, row_of, rows):
 
 
 @inner
-def store_places(first, size, depth, count, first_tile, outputs, spare):
-    """Write the depths, the numbers of tiles and the first tiles of `size` splats. spare: a block."""
+def store_places(first, size, seen, outputs):
+    """Write the depths, the numbers of tiles and the first tiles of `size` splats."""
     depths, counts, first_tiles = outputs
     if size == WIDTH:
-        store(depths, first, narrow(depth))
-        store_integers(counts, first, count)
-        store_integers(first_tiles, first, first_tile)
+        store(depths, first, get(seen, DEPTH))
+        store_integers(counts, first, get(seen, COUNT))
+        store_integers(first_tiles, first, get(seen, FIRST_TILE))
     else:
-        put_vector(spare, 0, (depth, count, first_tile))
         for lane in range(size):
-            depths[first + lane] = spare[lane]
-            counts[first + lane], first_tiles[first + lane] = int(spare[WIDTH + lane]), int(spare[2 * WIDTH + lane])
+            depths[first + lane] = seen[DEPTH * WIDTH + lane]
+            counts[first + lane], first_tiles[first + lane] = int(seen[COUNT * WIDTH + lane]), int(seen[FIRST_TILE * WIDTH + lane])
 
 
 @inner
@@ -142,7 +160,7 @@ def covariance_of(world):
 
 @inner
 def project_any(jac, has_covariances, world):
-    """The shapes of a block's splats on the image."""
+    """The splats' shapes on the image."""
     if has_covariances is not None:
         return ellipses.project_covariance(jac, covariance_of(world))
     return ellipses.project_axes(jac, ellipses.rotation(quaternion(world)), get_vector(world, SCALE))
@@ -181,7 +199,7 @@ def fill_at_center(view, reshaped, x, y, shape, opacity, compensation, block):
     compensated = opacity * compensation
     offset_from_middle = maximum(absolute(x * (2 / view.width) - 1), absolute(y * (2 / view.height) - 1))
     drawn = both(compensated >= view.min_alpha, offset_from_middle <= view.max_offset)
-    put(block, layout.GATE, broadcast(1))
+    put(block, layout.GATE, narrow(opacity * 0 + 1))
     if reshaped is not None:
         drawn, shape = reshape(view, drawn, shape, opacity, block)
     # alpha = peak·(w - w_end), down to `last_alpha`

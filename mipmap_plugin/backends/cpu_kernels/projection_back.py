@@ -5,14 +5,14 @@
 
 import math
 
-import numpy as np
 from numba import types
 
-from mipmap_plugin.backends.cpu_kernels import culling, ellipses, harmonics, inner, integrals, kernel, layout
+from mipmap_plugin.backends.cpu_kernels import culling, ellipses, inner, integrals, kernel, layout
 from mipmap_plugin.backends.cpu_kernels.blocks import get, get_vector, put, put_vector
-from mipmap_plugin.backends.cpu_kernels.columns import apart, load_four, load_three, repeated, store_rows, thrice, together, transpose
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, narrow, select, wide
-from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, scratch, store
+from mipmap_plugin.backends.cpu_kernels.colors_back import grad_colors, new_spaces
+from mipmap_plugin.backends.cpu_kernels.columns import apart, load_four, load_three, store_rows, together
+from mipmap_plugin.backends.cpu_kernels.lanes import PART, WIDTH, narrow, select, wide
+from mipmap_plugin.backends.cpu_kernels.memory import beyond, load, load_whole, pointer, scratch, store
 from mipmap_plugin.backends.cpu_kernels.projection import (
     COVARIANCE,
     MEAN,
@@ -22,14 +22,11 @@ from mipmap_plugin.backends.cpu_kernels.projection import (
     covariance_of,
     load_splat,
     load_splats,
-    narrowed,
-    new_bands,
     new_world,
     pointers,
     quaternion,
-    view_direction,
 )
-from mipmap_plugin.backends.cpu_kernels.tuples import apply, dot, plus, weighted_sum
+from mipmap_plugin.backends.cpu_kernels.tuples import apply, plus
 
 new_sums, new_rows = scratch(layout.GRADS * WIDTH, types.float64), scratch(WIDTH, types.int64)
 
@@ -44,8 +41,7 @@ def project_back(start, stop, flags, view, splats, table, firsts, tile_grads, gr
     stride = 3 * splats.sh.shape[1]
     colors = pointer(splats.sh), pointer(grads.sh), pointer(table), stride, len(grads.sh) > 0, start
     arrays, targets, tile_rows = pointers(splats), pointers(grads), pointer(tile_grads)
-    world, d_world, sums, rows, size = new_world(), new_world(), new_sums(), new_rows(), 0
-    bands = new_bands(), new_bands(), new_bands(), new_bands()
+    world, d_world, sums, rows, spaces, size = new_world(), new_world(), new_sums(), new_rows(), new_spaces(), 0
     for i in range(start, stop):
         if firsts[i] < firsts[i + 1]:
             sum_tiles(tile_rows, firsts[i], firsts[i + 1], size, sums)
@@ -58,8 +54,9 @@ def project_back(start, stop, flags, view, splats, table, firsts, tile_grads, gr
             else:
                 for lane in range(size):
                     load_splat(rows[lane], lane, arrays, covariances, world)
-            grad_splats(view, covariances, integrated, reshaped, world, sums, d_world)
-            grad_colors(view, fourth, third, rows, size, world, sums, colors, bands, d_world)
+            for part in range(0, size, PART):
+                grad_splats(view, covariances, integrated, reshaped, beyond(world, part), beyond(sums, part), beyond(d_world, part))
+            grad_colors(view, fourth, third, rows, size, world, sums, colors, spaces, d_world)
             if in_a_row:
                 add_grads(rows[0] - start, d_world, targets)
             else:
@@ -106,7 +103,7 @@ def add_four(array, at, field, d_world):
 @inner
 def added(lanes, field, d_world):
     """float32 lanes plus a field of a block, rounded once."""
-    return narrow(wide(lanes) + get(d_world, field))
+    return narrow(wide(lanes) + load_whole(d_world, field * WIDTH))
 
 
 @inner
@@ -128,7 +125,7 @@ def store_grads(i, lane, d_world, targets, has_covariances):
 
 @inner
 def grad_splats(view, has_covariances, integrated, reshaped, world, sums, d_world):
-    """Write the gradients of means, shapes and opacities, without the means' gradient through the color."""
+    """Write the gradients of means, shapes and opacities of a part of the splats, without the means' gradient through the color."""
     p = plus(apply(view.rotation, get_vector(world, MEAN)), view.translation)
     jac, opacity = ellipses.jacobian(view, p), get(world, OPACITY)
     if has_covariances is not None:
@@ -225,69 +222,3 @@ def grad_integral(view, shape, dilated, opacity, sums):
     d_shape = ellipses.grad_screen_filter(view, shape, dilated, opacity * 0 + 1, d_dilated, opacity * 0)
     d_u, d_v = get(sums, layout.GRAD_U) / long, get(sums, layout.GRAD_V) / short
     return d_shape, get(sums, layout.SUM) / opacity, sin * d_v - cos * d_u, -sin * d_u - cos * d_v
-
-
-@inner
-def grad_colors(view, fourth, third, rows, size, world, sums, colors, spaces, d_world):
-    """The gradients through the color: add those of the coefficients if wanted, and those of the means in `d_world`. spaces: for bands."""
-    bands, d_bands, bands_of, d_bands_of = spaces
-    direction, length = view_direction(view, get_vector(world, MEAN))
-    harmonics.basis(narrowed(direction), view.sh_degree, fourth, bands)
-    if third is not None:
-        transpose(bands, bands_of)
-        for lane in range(size):
-            grad_color_of_third(rows[lane], lane, view, colors, sums, bands_of, d_bands_of)
-        transpose(d_bands_of, d_bands)
-    else:
-        for lane in range(size):
-            grad_color(rows[lane], lane, view, colors, sums, bands, d_bands)
-    if view.sh_degree > 0:
-        d_x, d_y, d_z = harmonics.grad_direction(narrowed(direction), view.sh_degree, fourth, d_bands)
-        d_direction = wide(d_x), wide(d_y), wide(d_z)
-        per_length = select(length > 0, 1 / length, 0.0)
-        d_mean = weighted_sum(per_length, d_direction, -dot(d_direction, direction) * per_length, direction)
-        put_vector(d_world, MEAN, plus(get_vector(d_world, MEAN), d_mean))
-
-
-@inner
-def grad_shown(i, lane, view, table, sums):
-    """The gradient of splat i's color. A channel that was clamped to black or to the largest color has none."""
-    row, zero, largest = i * layout.SPLAT_FIELDS, np.float32(0), np.float32(view.max_color)
-    d_red = np.float32(sums[layout.GRAD_RED * WIDTH + lane]) if 0 < table[row + layout.RED] < largest else zero
-    d_green = np.float32(sums[layout.GRAD_GREEN * WIDTH + lane]) if 0 < table[row + layout.GREEN] < largest else zero
-    d_blue = np.float32(sums[layout.GRAD_BLUE * WIDTH + lane]) if 0 < table[row + layout.BLUE] < largest else zero
-    return d_red, d_green, d_blue
-
-
-@inner
-def grad_color(i, lane, view, colors, sums, bands, d_bands):
-    """The gradients of splat i's coefficients and, in its lane, of its spherical harmonics."""
-    sh, d_sh, table, stride, wanted, start = colors
-    at, used = i * stride, (view.sh_degree + 1) ** 2
-    d_red, d_green, d_blue = grad_shown(i, lane, view, table, sums)
-    for j in range(used):
-        d_bands[j * WIDTH + lane] = d_red * sh[at + 3 * j] + d_green * sh[at + 3 * j + 1] + d_blue * sh[at + 3 * j + 2]
-    if wanted:
-        into = at - start * stride
-        for j in range(used):
-            band = bands[j * WIDTH + lane]
-            d_sh[into + 3 * j] += d_red * band
-            d_sh[into + 3 * j + 1] += d_green * band
-            d_sh[into + 3 * j + 2] += d_blue * band
-
-
-@inner
-def grad_color_of_third(i, lane, view, colors, sums, bands_of, d_bands_of):
-    """`grad_color` for harmonics of degree 3, to the same bits; bands lane by lane."""
-    sh, d_sh, table, stride, wanted, start = colors
-    at = i * stride
-    d_red, d_green, d_blue = grad_shown(i, lane, view, table, sums)
-    first, second, third = repeated(d_red, d_green, d_blue)
-    one, two, three = load_three(sh, at)
-    reds, greens, blues = apart((first * one, second * two, third * three))
-    store(d_bands_of, lane * WIDTH, reds + greens + blues)
-    if wanted:
-        into, (one, two, three) = at - start * stride, thrice(load(bands_of, lane * WIDTH))
-        store(d_sh, into, load(d_sh, into) + first * one)
-        store(d_sh, into + WIDTH, load(d_sh, into + WIDTH) + second * two)
-        store(d_sh, into + 2 * WIDTH, load(d_sh, into + 2 * WIDTH) + third * three)

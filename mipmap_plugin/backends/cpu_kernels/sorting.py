@@ -18,8 +18,8 @@ from numba import types
 from mipmap_plugin.backends.cpu_kernels import binning, inner, kernel, layout, threads
 from mipmap_plugin.backends.cpu_kernels.blocks import put
 from mipmap_plugin.backends.cpu_kernels.columns import outlines
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH
-from mipmap_plugin.backends.cpu_kernels.memory import pointer, scratch
+from mipmap_plugin.backends.cpu_kernels.lanes import PART, WIDTH
+from mipmap_plugin.backends.cpu_kernels.memory import beyond, pointer, scratch
 from mipmap_plugin.backends.cpu_kernels.records import Lists
 from mipmap_plugin.backends.cpu_kernels.threads import Team
 from mipmap_plugin.process.pool import empty
@@ -123,7 +123,9 @@ def write_slots(start, stop, table, counts, first_tiles, height, width, befores,
             slot += count
             if waiting == WIDTH or (waiting > 0 and i == last - 1):
                 put_outlines(table, many, waiting, block)
-                binning.write_tiles(block, spans, (1 << waiting) - 1, next_slots, width, height, tiles_of, run_counts)
+                for part in range(0, waiting, PART):
+                    drawn = (1 << min(waiting - part, PART)) - 1
+                    binning.write_tiles(beyond(block, part), spans, drawn, beyond(next_slots, part), width, height, tiles_of, run_counts)
                 waiting = 0
         if last == len(counts):
             firsts[last] = slot

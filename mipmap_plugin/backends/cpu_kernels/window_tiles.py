@@ -14,11 +14,12 @@ from mipmap_plugin.backends.cpu_kernels import inner, kernel, layout, windows
 from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA
 from mipmap_plugin.backends.cpu_kernels.compositing import fill_range, init_tile, tile_box, unfinished_patches, write_tile
 from mipmap_plugin.backends.cpu_kernels.compositing_back import init_tile_back, write_sums
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, lowest_bit, select, summed, summed_product, zero_sum
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, lowest_bit, select
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, row_of, scratch, store
 from mipmap_plugin.backends.cpu_kernels.patches import BATCH, find_patches, new_found
 from mipmap_plugin.backends.cpu_kernels.planes import PATCHES, PLANE, STATE_SIZE, STOPS, TRANSMITTANCE, blend, distances, unblend
 from mipmap_plugin.backends.cpu_kernels.sorting import sort
+from mipmap_plugin.backends.cpu_kernels.sums import summed, summed_product, zero_sum
 from mipmap_plugin.render_settings import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
 USUAL_LIMITS = (MAX_ALPHA, MIN_TRANSMITTANCE, 0.0)
