@@ -104,4 +104,13 @@ FURTHER = (
         replace(WEBGL, min_alpha=1 / 256, radius=3.5, frame=1.5), near_plane=0.1 * 2 / 0.75,
         unlike="in VR splats are blended in linear light" + UNSEEN,
     ),
+    Viewer(
+        # A splat's square ends at 3 standard deviations along x and along y.
+        "kiri", "KIRI's 3DGS Render, an add-on for Blender (its viewport)",
+        "3dgs-render-blender-addon 4.1.5 (a753a5d), vert.glsl, frag.glsl, composite_frag.glsl, __init__.py", "classic", DILATION,
+        replace(WEBGL, min_alpha=1 / 255, max_alpha=0.99, radius=3.0, frame=1.3, max_color=1.0),
+        unlike="view-dependent colors are those seen from another place, for it takes the view matrix's translation for the camera's center; what is "
+        "half covered is darker, and the background shines through in linear light; pictures that it renders to files are rounded once, and their "
+        "colors not limited" + UNSEEN,
+    ),
 )  # fmt: skip

@@ -150,7 +150,7 @@ BUILT_IN = (
 IN_FILES = re.compile(r"\w[\w.+-]*")
 
 ALIASES = {
-    **dict.fromkeys(("inria", "kiri", "3dgs.cpp"), "classic"),
+    **dict.fromkeys(("inria", "3dgs.cpp"), "classic"),
     **dict.fromkeys(("supersplat", "supersplat-viewer"), "playcanvas"),
     **{"mkkellogg": "gaussian-splats-3d", "threejs": "three", "drei": "aframe", "godot": "gdgs"},
     **{"nerfstudio": "gsplat", "nerfstudio-antialiased": "gsplat-antialiased"},
