@@ -248,7 +248,7 @@ class FrozenBase:
 
     @cached_property
     def _near_planes(self) -> NearPlanes:
-        return NearPlanes(self.model, self.effects(), lambda: self.backend()[0])
+        return NearPlanes(self.model, self.effects(), partial(choose_backend, self._backend, self._needs))
 
     def target(self, viewer: str | None) -> Effects:
         """How the adapted file is rendered. Raises SettingsError as `targets` does, and for the name of a group of viewers."""

@@ -1,5 +1,7 @@
 """Files made for a viewer: adapted as it draws, and named after it."""
 
+import gc
+import weakref
 from unittest.mock import Mock
 
 import anchor_checkpoints
@@ -17,6 +19,7 @@ from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained, flattened
 from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.process.garbage import uncollected
 from mipmap_plugin.wrap import wrap_model
 
 BRIEF = dict(steps=2, extra_views=2, merge_to=1.0, warm_up=0)
@@ -72,6 +75,16 @@ def test_it_is_another_renderer_where_a_view_shows_a_splat_between_both_near_pla
         assert (model.target(viewer) == model.effects(viewer=viewer)) == drawn
         assert (model.target(viewer) == model.effects()) != drawn
         assert model.targets(viewer, views[:2])[viewer] == model.effects()
+
+
+def test_a_base_whose_near_planes_were_looked_at_is_freed_at_once():
+    model = wrapped()
+    gc.collect()
+    assert model.target("gsplat") == model.effects()
+    freed = weakref.ref(model)
+    with uncollected():
+        del model
+        assert freed() is None
 
 
 def test_an_unknown_viewer_is_told_the_known_ones():

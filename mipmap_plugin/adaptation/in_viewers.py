@@ -26,7 +26,7 @@ class NearPlanes:
 
     base: SplatModel
     trained: Effects  # how the base is rendered
-    backend: Callable[[], Backend]  # what renders it
+    choice: Callable[[], tuple[Backend, str]]  # of what renders it
     known: dict[tuple[float, str], bool] = field(default_factory=dict)  # by near plane and views
 
     def target(self, effects: Effects, views: Callable[[], Sequence[Camera]]) -> Effects:
@@ -41,7 +41,7 @@ class NearPlanes:
     @torch.no_grad()
     def _alike(self, near: float, views: Sequence[Camera]) -> bool:
         nearest, farthest = sorted((near, self.trained.near_plane))
-        effects, means, backend = replace(self.trained, near_plane=nearest), self.base.parameters()["means"], self.backend()
+        effects, means, (backend, _) = replace(self.trained, near_plane=nearest), self.base.parameters()["means"], self.choice()
         for view in views:
             depths = view.to_camera(means)[:, 2]
             between = (depths > nearest) & (depths <= farthest)
