@@ -15,13 +15,14 @@ from mipmap_plugin.adaptation import notebook
 from mipmap_plugin.adaptation.adapted import Adapted, as_start, render_model
 from mipmap_plugin.adaptation.choosing import choose, mergeable_settings
 from mipmap_plugin.adaptation.conversion import Stages, conversion
+from mipmap_plugin.adaptation.in_viewers import NearPlanes
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import LIMIT, BaseImages
 from mipmap_plugin.adaptation.target.photographs import Photographs, placed
 from mipmap_plugin.adaptation.target.portable import settings_for_several
 from mipmap_plugin.adaptation.viewpoints import ClearViews, Viewpoints, orbit_of
-from mipmap_plugin.adaptation.views import choose_views, refuse_blind
+from mipmap_plugin.adaptation.views import choose_views, refuse_blind, refuse_large
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
 from mipmap_plugin.camera import ONE_PIXEL, Camera, checked, digest_of, of_base_scale
@@ -186,17 +187,17 @@ class FrozenBase:
         settings = mergeable_settings(model, settings)
         if images is not None and self.model.traits.exposures.changed:
             raise SettingsError("the images were exposed differently, which adaptation does not support (exposure.json); leave them out")
-        config, targets = self._planned(recipe, scale, viewer, settings)
+        scene = None if images is None else self.place(images)
+        config, targets = self._planned(recipe, scale, viewer, settings, cameras or ())
         first = conversion(config, self.effects(), targets.values(), scale) if finer is None else None
         views = {} if cameras is None else {"views": digest_of(cameras)}
         inputs = self.asked | views | ({} if images is None else {"photographs": images.digest()})
-        photographs = None if images is None else Photographs(self.place(images), self.cameras, self.background)
-        if cameras is None:
-            cameras = photographs.cameras if photographs else self.cameras
+        photographs = None if scene is None else Photographs(scene, self.cameras, self.background)
+        cameras = (photographs or self).cameras if cameras is None else cameras
         needs = [replace(self._needs, screen_filter=target.screen_filter, settings=target.settings) for target in targets.values()]
         backend, note, has_gradients = choose(self._backend, config, needs, self._needs)
         if config.steps:
-            self._refuse_large(cameras or self.views(), scale)
+            refuse_large(cameras or self.views(), self.model, scale)
         if finer is not None and finer.scale <= scale:
             raise SettingsError(f"start: x{finer.scale:g} is not finer than x{scale:g}; leave it out")
         base_in_viewer = model if (in_viewer := self.read_by(viewer)) is self.model else in_viewer
@@ -211,15 +212,12 @@ class FrozenBase:
         adapted.report.cameras_from.update(self.cameras_from)
         return replace(adapted, cameras=self.views())
 
-    def _planned(self, recipe: str, scale: float, viewer: str | None, settings: dict[str, Any]) -> tuple[AdaptConfig, dict[str, Effects]]:
+    def _planned(
+        self, recipe: str, scale: float, viewer: str | None, settings: dict[str, Any], cameras: Sequence[Camera]
+    ) -> tuple[AdaptConfig, dict[str, Effects]]:
         """The settings of an adaptation, and `targets`."""
-        config, targets = make_config(recipe, scale, **settings), self.targets(viewer)
+        config, targets = make_config(recipe, scale, **settings), self.targets(viewer, cameras)
         return config if len(targets) == 1 else make_config(recipe, scale, **(settings_for_several(config) | settings)), targets
-
-    def _refuse_large(self, views: Sequence[Camera], scale: float) -> None:
-        """Raise SettingsError if the memory cannot hold the largest image that is adapted to."""
-        largest = max(views, key=lambda camera: camera.width * camera.height).zoomed(scale)
-        check_image(largest.width, largest.height, self.model.parameters()["means"].device)
 
     def _base_images(self, model: SplatModel, backend: Backend, keep: bool) -> BaseImages:
         """Those that are drawn already, or none yet: of another base. `keep`: for further scales and stages."""
@@ -238,16 +236,19 @@ class FrozenBase:
         refuse_output(state_path(path), True, parts, is_file=True)
         refuse_unwritable(path, 0 if source is None else source.stat().st_size)
 
-    def targets(self, viewer: str | None) -> dict[str, Effects]:
-        """How an adapted file for `viewer` is rendered, by viewer: several for "portable", and one named "" for None.
-
-        Raises SettingsError for a model whose splats no viewer renders.
+    def targets(self, viewer: str | None, cameras: Sequence[Camera] = ()) -> dict[str, Effects]:
+        """How an adapted file for `viewer` is rendered, by viewer: several for "portable", and one named "" for None; as the base's training did
+        where these `cameras`, by default the base's `views`, show no difference. Raises SettingsError for a model whose splats no viewer renders.
         """
         if viewer is None:
             return {"": self.effects()}
         if reason := why_no_viewer(self.model):
             raise SettingsError(f"{self.model.family}: {reason}; leave the viewer {viewer} out")
-        return {name: self.effects(viewer=name) for name in viewers_for(viewer)}
+        return {name: self._near_planes.target(self.effects(viewer=name), lambda: cameras or self.views()) for name in viewers_for(viewer)}
+
+    @cached_property
+    def _near_planes(self) -> NearPlanes:
+        return NearPlanes(self.model, self.effects(), partial(choose_backend, self._backend, self._needs))
 
     def target(self, viewer: str | None) -> Effects:
         """How the adapted file is rendered. Raises SettingsError as `targets` does, and for the name of a group of viewers."""

@@ -1,11 +1,14 @@
 """Files made for a viewer: adapted as it draws, and named after it."""
 
+import gc
+import weakref
 from unittest.mock import Mock
 
 import anchor_checkpoints
 import moving
 import pytest
 import tiny
+import torch
 
 from mipmap_plugin.cli import main
 from mipmap_plugin.commands.adapt import _made_for
@@ -16,6 +19,7 @@ from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained, flattened
 from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.process.garbage import uncollected
 from mipmap_plugin.wrap import wrap_model
 
 BRIEF = dict(steps=2, extra_views=2, merge_to=1.0, warm_up=0)
@@ -44,6 +48,43 @@ def test_the_report_and_the_file_say_what_viewer_they_are_for(tmp_path):
     assert adapted.report.viewer == "spark"
     assert provenance_of(read_ply(adapted.save(tmp_path / "new.ply")).comments)["viewer"] == "spark"
     assert wrapped().adapt(1 / 4, recipe="instant").report.provenance()["viewer"] is None
+
+
+# By the near plane of a base's training, a viewer that draws from another depth on.
+OTHER_NEAR = {0.2: "gsplat", 0.01: "classic"}
+
+
+@pytest.mark.parametrize(("near", "viewer"), OTHER_NEAR.items())
+@pytest.mark.parametrize("scale", [1 / 2, 1])
+def test_a_viewer_that_differs_in_its_near_plane_alone_changes_nothing_where_no_splat_is_near(near, viewer, scale):
+    model = wrapped(near_plane=near)
+    plain, file = (model.adapt(scale, viewer=name, **BRIEF) for name in (None, viewer))
+    assert (file.report.viewer, file.report.returned) == (viewer, plain.report.returned)
+    assert all(torch.equal(tensor, plain.model.parameters()[name]) for name, tensor in file.model.parameters().items())
+    assert ("as it is" in file.report.returned) == (scale == 1)
+
+
+@pytest.mark.parametrize(("near", "viewer"), OTHER_NEAR.items())
+def test_it_is_another_renderer_where_a_view_shows_a_splat_between_both_near_planes(near, viewer):
+    views, trained = tiny.cameras(), TrainedScale(near_plane=near)
+    close, beside = (views[2].center + depth @ views[2].viewmat[:3, :3] for depth in torch.tensor([[0, 0, 0.1], [9, 0, 0.1]], dtype=torch.float64))
+    for point, drawn in ((close, True), (beside, False)):
+        splats = tiny.gaussians(40)
+        splats.means[0], splats.scales[0] = point, 0.005
+        model = wrap_model(VanillaModel.from_gaussians(splats, trained), cameras=views)
+        assert (model.target(viewer) == model.effects(viewer=viewer)) == drawn
+        assert (model.target(viewer) == model.effects()) != drawn
+        assert model.targets(viewer, views[:2])[viewer] == model.effects()
+
+
+def test_a_base_whose_near_planes_were_looked_at_is_freed_at_once():
+    model = wrapped()
+    gc.collect()
+    assert model.target("gsplat") == model.effects()
+    freed = weakref.ref(model)
+    with uncollected():
+        del model
+        assert freed() is None
 
 
 def test_an_unknown_viewer_is_told_the_known_ones():

@@ -18,7 +18,7 @@ from mipmap_plugin.adaptation.viewpoints import Viewpoints
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.limits import derived_seed
+from mipmap_plugin.limits import check_image, derived_seed
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.contract import row_opacities
 from mipmap_plugin.models.health import units
@@ -205,6 +205,12 @@ def _draws(view: Camera, model: SplatModel, near: float) -> bool:
     """Whether a row of the parameters that is opaque enough to be drawn lies in the view, farther than the near plane."""
     inside = view.in_picture(view.to_camera(model.parameters()["means"].detach()), near)
     return bool(inside.any()) and bool((row_opacities(model, [view])[inside] >= MIN_ALPHA).any())
+
+
+def refuse_large(views: Sequence[Camera], model: SplatModel, scale: float) -> None:
+    """Raise SettingsError if the memory cannot hold the largest image that is adapted to."""
+    largest = max(views, key=lambda camera: camera.width * camera.height).zoomed(scale)
+    check_image(largest.width, largest.height, model.parameters()["means"].device)
 
 
 def too_unlike(views: Sequence[Camera]) -> str:

@@ -54,6 +54,7 @@ NO_SPZ = {
     "gaussian-splats-3d": "GaussianSplats3D 0.4.7 reads .spz up to version 2, and splat-transform writes 3 at least",
     **dict.fromkeys(("antimatter15", "aframe", "gsplat-js"), "antimatter15/splat, aframe-gaussian-splatting and gsplat.js read no .spz"),
     "mip": "Mip-Splatting reads PLYs only, with a column filter_3D that .spz has no place for",
+    "kiri": "KIRI's add-on for Blender reads PLYs only",
 }
 
 # Viewers that read a .glb as it is written here, and names for whatever draws as 3DGS does: three.js by an extension of its loader, Babylon.js by the
@@ -63,7 +64,7 @@ NO_GLB = {
     **{
         viewer: f"{viewer} reads no splats in glTF"
         for viewer in ("spark", "gaussian-splats-3d", "gsplat-js", "antimatter15", "aframe", "mip", "brush", "lichtfeld", "web-splat",
-                       "visionary", "metalsplatter", "vk-gaussian-splatting", "splatapult", "gdgs", "3dgs.cpp")
+                       "visionary", "metalsplatter", "vk-gaussian-splatting", "splatapult", "gdgs", "3dgs.cpp", "kiri")
     },
     "cesium": "Cesium draws no splats in glTF but SPZ, as levels --tiles writes them",
 }  # fmt: skip

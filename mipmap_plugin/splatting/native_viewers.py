@@ -37,6 +37,8 @@ BRUSH = Viewer(
     RenderSettings(max_alpha=0.999), near_plane=0.01, sh_degree=4, unlike="a file with SplatRenderMode mip is drawn as mip" + UNSEEN,
 )  # fmt: skip
 
+GSPLAT = "gsplat 1.6.0 (90d7b4b), rendering, gsplat_viewer, Common.h; nerfstudio 50e0e3c, splatfacto"
+
 # LichtFeld Studio's least alpha, at which an opaque splat ends.
 LICHTFELD_ALPHA = 0.5 / 255
 
@@ -44,8 +46,12 @@ LICHTFELD_ALPHA = 0.5 / 255
 # of 0.075: the worst viewer of lego at x1/4 would have 3.3 dB less, the mean 2.7 (docs/viewers.md).
 FURTHER = (
     Viewer(
-        "gsplat", "gsplat, nerfstudio", "gsplat 1.6.0 (90d7b4b), gsplat_viewer, Common.h; nerfstudio, splatfacto", "classic", DILATION,
-        near_plane=0.01, unlike="a splat ends at 3.33 standard deviations; until gsplat 1.5 its largest alpha was 0.999",
+        "gsplat", "gsplat, nerfstudio", GSPLAT, "classic", DILATION, near_plane=0.01,
+        unlike="a splat ends at 3.33 standard deviations; until gsplat 1.5 its largest alpha was 0.999",
+    ),
+    Viewer(
+        "gsplat-antialiased", "gsplat, nerfstudio, their mode antialiased", GSPLAT, "antialiased", DILATION, near_plane=0.01,
+        unlike="as gsplat; until gsplat 1.5 its compensation had no lower bound",
     ),
     Viewer(
         "lichtfeld", "LichtFeld Studio",
@@ -97,5 +103,14 @@ FURTHER = (
         "splatapult", "Splatapult", "splatapult e87960f, splat and presort shaders, app.cpp", "classic", DILATION,
         replace(WEBGL, min_alpha=1 / 256, radius=3.5, frame=1.5), near_plane=0.1 * 2 / 0.75,
         unlike="in VR splats are blended in linear light" + UNSEEN,
+    ),
+    Viewer(
+        # A splat's square ends at 3 standard deviations along x and along y.
+        "kiri", "KIRI's 3DGS Render, an add-on for Blender (its viewport)",
+        "3dgs-render-blender-addon 4.1.5 (a753a5d), vert.glsl, frag.glsl, composite_frag.glsl, __init__.py", "classic", DILATION,
+        replace(WEBGL, min_alpha=1 / 255, max_alpha=0.99, radius=3.0, frame=1.3, max_color=1.0),
+        unlike="view-dependent colors are those seen from another place, for it takes the view matrix's translation for the camera's center; what is "
+        "half covered is darker, and the background shines through in linear light; pictures that it renders to files are rounded once, and their "
+        "colors not limited" + UNSEEN,
     ),
 )  # fmt: skip

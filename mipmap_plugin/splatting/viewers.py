@@ -42,7 +42,7 @@ PLAYCANVAS = replace(
     packing=Packing(log_scales=(-12 + 21 / 255, 9.0, 21 / 255), quats="stereographic"),
 )
 PLAYCANVAS_SOURCE = "playcanvas 2.23.3, gsplatCorner, gsplat and containerCompactWrite shaders (SuperSplat, supersplat-viewer 1.36)"
-INRIA_UNLIKE = "INRIA ends a splat at three standard deviations, rounded up to tiles; gsplat at 3.33, and it draws from a depth of 0.01 on"
+INRIA_UNLIKE = "a splat ends at three standard deviations, rounded up to tiles"
 
 # RGBA of 8 bits, colors of SH degree 0 within 0..1.
 EIGHT_BITS = Packing(color=1 / 255)
@@ -58,8 +58,7 @@ BUILT_IN = (
         "classic", DILATION, near_plane=NEAR_PLANE, unlike=INRIA_UNLIKE,
     ),
     Viewer(
-        "antialiased", "3DGS with compensation: INRIA --antialiasing, gsplat, nerfstudio",
-        "diff-gaussian-rasterization, dr_aa; gsplat 1.5, rasterize_mode antialiased",
+        "antialiased", "3DGS with compensation: INRIA --antialiasing", "diff-gaussian-rasterization, dr_aa",
         "antialiased", DILATION, near_plane=NEAR_PLANE, unlike=INRIA_UNLIKE,
     ),
     Viewer(
@@ -151,9 +150,10 @@ BUILT_IN = (
 IN_FILES = re.compile(r"\w[\w.+-]*")
 
 ALIASES = {
-    **dict.fromkeys(("inria", "kiri", "3dgs.cpp"), "classic"),
+    **dict.fromkeys(("inria", "3dgs.cpp"), "classic"),
     **dict.fromkeys(("supersplat", "supersplat-viewer"), "playcanvas"),
-    **{"mkkellogg": "gaussian-splats-3d", "threejs": "three", "drei": "aframe", "nerfstudio": "gsplat", "godot": "gdgs"},
+    **{"mkkellogg": "gaussian-splats-3d", "threejs": "three", "drei": "aframe", "godot": "gdgs"},
+    **{"nerfstudio": "gsplat", "nerfstudio-antialiased": "gsplat-antialiased"},
 }
 
 # What is asked for, but has no record: why, and what to take instead.

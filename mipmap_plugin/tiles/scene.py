@@ -67,8 +67,8 @@ class TiledScene:
         self.extras: list[str] = stored["extras"]  # columns of the base that tiles do not hold
         self.digest: str = stored["digest"]
         self.wrapped = self._wrapped(base, stored["sample"])
-        targets = self.wrapped.targets(viewer)
-        self.target: Effects = next(iter(targets.values()))
+        self.wrapped.targets(viewer)  # raises for what no viewer draws
+        self.target = self.wrapped.effects(viewer=viewer)  # the sample does not tell whether splats that another near plane shows are in view
         self.backend, self.backend_note = self._backend(base.backend)
         self.asked_steps, self.config = config.steps, self._affordable(config)
 

@@ -152,6 +152,16 @@ def test_lichtfeld_draws_half_a_step_of_8_bits_and_leaves_out_by_the_center(back
 
 
 @BOTH
+def test_kiri_leaves_out_by_the_center_and_limits_colors_as_its_frame_buffer_does(backend):
+    """Its name was one for INRIA's viewer, which does neither."""
+    large, means = (900.0, 900.0, 0.9), [(halves * SIZE / 2 * DEPTH / FOCAL, 0.0, DEPTH) for halves in (1.29, 1.31)]
+    seen = {viewer: [bool(alpha(backend, viewer, splat(*large, means=each)).max() > 0) for each in means] for viewer in ("kiri", "inria")}
+    assert seen == {"kiri": [True, False], "inria": [True, True]}
+    bright = backend.render(splat(4.0, 4.0, 0.5, 9.0), camera(), find_viewer("kiri").effects(Effects(0))).image
+    assert bright[MIDDLE, MIDDLE, 0].item() == pytest.approx(0.5, abs=1 / 255)
+
+
+@BOTH
 def test_a_long_splat_keeps_its_shape(backend):
     stretching, plain = find_viewer("gaussian-splats-3d").effects(Effects(0)), replace(find_viewer("gaussian-splats-3d"), settings=USUAL)
     long = splat(4.0, 1.0, turn=0.5)

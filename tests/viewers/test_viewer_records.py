@@ -15,8 +15,9 @@ from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.backends.triton import TritonBackend
 from mipmap_plugin.effects import Effects, explain
 from mipmap_plugin.errors import PluginError, SettingsError
+from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.render_settings import USUAL, RenderSettings
-from mipmap_plugin.splatting.viewers import BUILT_IN, EDGE, Viewer, find_viewer
+from mipmap_plugin.splatting.viewers import BUILT_IN, EDGE, Viewer, find_viewer, viewers_for
 from mipmap_plugin.wrap import Wrapped
 
 # Records
@@ -26,6 +27,15 @@ def test_a_viewer_without_a_record_is_refused_with_what_to_take_instead():
     with pytest.raises(SettingsError, match=r"^viewer polycam: .*take portable"):
         find_viewer("polycam")
     assert find_viewer("nerfstudio") is find_viewer("gsplat") and find_viewer("inria") is find_viewer("classic")
+
+
+@pytest.mark.parametrize("screen_filter", ["classic", "antialiased"])
+def test_gsplat_draws_with_both_filters_from_nearer_on_than_inria_s_viewer(screen_filter):
+    base = wrap_model(tiny.model(trained=TrainedScale(screen_filter, near_plane=0.01)), cameras=tiny.cameras(1))
+    name = {"classic": "gsplat"}.get(screen_filter, "gsplat-antialiased")
+    assert base.effects(viewer=name) == base.effects() == replace(base.effects(viewer=screen_filter), near_plane=0.01)
+    assert base.effects(viewer=screen_filter).near_plane == 0.2
+    assert find_viewer(name.replace("gsplat", "nerfstudio")) is find_viewer(name) and name not in viewers_for("portable")
 
 
 def test_effects_of_a_viewer_are_on_and_the_rest_is_off():

@@ -49,7 +49,7 @@ def test_without_viser_the_command_says_what_to_install(tmp_path, monkeypatch, c
 def test_a_viewer_is_listed_once_under_the_name_that_was_asked_for(base):
     viewers, _ = _choices(base, "supersplat")
     assert viewers[:2] == ["supersplat", None] and "playcanvas" not in viewers
-    assert {"classic", "spark", "aframe"} < {*viewers} and not {"inria", "kiri", "drei", "threejs"} & {*viewers}
+    assert {"classic", "spark", "aframe"} < {*viewers} and not {"inria", "drei", "threejs"} & {*viewers}
     assert find_viewer("drei") is find_viewer("aframe")  # whose shader it has
 
 
