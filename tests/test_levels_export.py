@@ -27,7 +27,7 @@ from mipmap_plugin.models.vanilla import VanillaModel
 pytestmark = pytest.mark.usefixtures("brief_ladders", "few_views")
 
 # A stand-in for splat-transform: it lists no GPU, writes its arguments to the output, with two chunks, and fails for a file that says that it is
-# broken, or has SH degree 4. Of an SPZ it writes the header: 60 splats of degree 1.
+# broken, or has SH degree 4. Of an SPZ it writes 60 splats of degree 1.
 STAND_IN = """#!{python}
 import gzip, json, pathlib, struct, sys
 if sys.argv[1:] == ["--list-gpus"]:
@@ -40,7 +40,7 @@ contents = [pathlib.Path(word).read_bytes() for word in words if word.endswith("
 if any(b"comment broken" in content or b" f_rest_45" in content for content in contents):
     sys.exit("readPly: unrecognized")
 if target.endswith(".spz"):
-    sys.exit(pathlib.Path(target).write_bytes(gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, 60, 1, 12, 0, 0))) and None)
+    sys.exit(pathlib.Path(target).write_bytes(gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, 60, 1, 12, 0, 0) + bytes(60 * 29))) and None)
 counts = lambda count: {{"0": {{"count": count}}, "2": {{"count": 1}}}}
 leaf = lambda x, count: {{"bound": {{"min": [x, 0, 0], "max": [x + 2, 1, 1]}}, "lods": counts(count)}}
 pathlib.Path(target).write_text(json.dumps({{"asked": words, "lodLevels": 3, "tree": {{"children": [leaf(0, 30), leaf(2, 10)]}}}}))

@@ -154,6 +154,13 @@ def png(image: Tensor) -> bytes:
     return file.getvalue()
 
 
+def lossless_webp(pixels: np.ndarray) -> bytes:
+    """The WebP file of RGBA pixels [H, W, 4] of 8 bits, each as it is, transparent ones too."""
+    file = io.BytesIO()
+    Image.fromarray(pixels, "RGBA").save(file, format="WEBP", lossless=True, exact=True)
+    return file.getvalue()
+
+
 def paletted(image: Tensor) -> tuple[np.ndarray, np.ndarray]:
     """An image [H, W, 3] as numbers of colors, [H, W], and these colors, at most 256, [C, 3] in 0..255; errors are spread over neighbors."""
     quantized = Image.fromarray(_bytes(image)).quantize()

@@ -79,11 +79,8 @@ OF_FILES = (".pt", ".pth", ".ckpt", ".npz", ".npy", ".glb", ".gltf", ".obj", ".u
 TOOL = "splat-transform"
 INSTALL = "npm install -g @playcanvas/splat-transform"
 
-# Seconds; ten million splats take one minute, but for SOG without a GPU.
+# Seconds; ten million splats take one minute.
 LONGEST = 1200
-
-# Adapters that splat-transform lists beside GPUs, and that are processors.
-SOFTWARE = re.compile("llvmpipe|swiftshader|lavapipe|software|basic render", re.IGNORECASE)
 
 
 def is_written(path: Path) -> bool:
@@ -196,14 +193,37 @@ def write_exchange(path: Path, write: Callable[[Path], Any], *, overwrite: bool)
         ending = next(suffix for suffix in WRITTEN if path.name.lower().endswith(suffix))
         plain, converted = Path(folder, "plain.ply"), Path(folder, f"made{ending}")
         write(plain)
-        _settle_frame(tool, converted, plain)
-        if reason := _run(tool, [plain], converted):
-            raise OutputError(f"{path}: {TOOL} does not write it ({reason})")
-        kind = next(kind for kind, (_, suffix) in EXCHANGE.items() if suffix == ending)
-        if kind != "sog" and _mode(plain) == "antialiased" and not _mode(converted, kind):  # the versions that write SOG say it
-            mark_antialiased(converted)
+        if ending == ".sog":
+            _write_sog(plain, converted)
+        else:
+            _convert(tool, plain, converted, path)
         shutil.copyfile(converted, temporary)
     return path
+
+
+def _write_sog(plain: Path, converted: Path) -> None:
+    from mipmap_plugin.formats.ply import read_ply  # and NumPy, without which options are read
+    from mipmap_plugin.formats.sog import write_sog
+
+    write_sog(converted, read_ply(plain).columns, antialiased=_mode(plain) == "antialiased")
+
+
+def _convert(tool: Sequence[str], plain: Path, converted: Path, path: Path) -> None:
+    """Convert a PLY by splat-transform. Raises OutputError, naming the output `path`."""
+    kind = next(kind for kind, (_, suffix) in EXCHANGE.items() if converted.name.endswith(suffix))
+    as_it_is = None
+    if kind == "spz":
+        from mipmap_plugin.formats.ply import read_ply  # as above
+        from mipmap_plugin.formats.spz import refine_harmonics
+
+        as_it_is = read_ply(plain).columns  # in the frame of the file
+    _settle_frame(tool, converted, plain)
+    if reason := _run(tool, [plain], converted):
+        raise OutputError(f"{path}: {TOOL} does not write it ({reason})")
+    if as_it_is is not None:
+        refine_harmonics(converted, as_it_is)
+    if _mode(plain) == "antialiased" and not _mode(converted, kind):
+        mark_antialiased(converted)
 
 
 def find_tool() -> list[str] | None:
@@ -221,30 +241,14 @@ def find_tool() -> list[str] | None:
     return command if version.returncode == 0 else None
 
 
-def graphics_card(tool: Sequence[str]) -> str:
-    """The number of the first GPU that splat-transform lists; empty if there is none."""
-    try:
-        listed = subprocess.run([*tool, "--list-gpus"], capture_output=True, text=True, errors="replace", timeout=60, check=False).stdout
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return next((number for number, name in re.findall(r"^\[(\d+)\] (.*)$", listed, re.MULTILINE) if not SOFTWARE.search(name)), "")
-
-
-def table_options(card: str) -> list[str]:
-    """How SOG's table of spherical harmonics is found: on the GPU of that number; without one, in a single iteration, for each takes minutes."""
-    return ["--gpu", card] if card else ["--gpu", "cpu", "--sh-iterations", "1"]
-
-
 def _run(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str:
     """Run splat-transform. Returns its error message, empty on success."""
-    options = table_options(graphics_card(tool)) if target.suffix.lower() == ".sog" else ["--gpu", "cpu"]
-    options += ["--spz-version", SPZ_VERSION] if _is_spz(target) else []
+    options = ["--gpu", "cpu", *(["--spz-version", SPZ_VERSION] if _is_spz(target) else [])]
     command = [*tool, "--quiet", "--overwrite", *options, *map(str, inputs), str(target)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=LONGEST, check=False)
     except subprocess.TimeoutExpired:
-        slow = "; without a GPU SOG takes so long; .spz and .compressed.ply do not" if "--sh-iterations" in options else ""
-        return f"not ready after {LONGEST // 60} minutes{slow}"
+        return f"not ready after {LONGEST // 60} minutes"
     except OSError as error:
         return str(error)[:160]
     if done.returncode == 0 and target.is_file():

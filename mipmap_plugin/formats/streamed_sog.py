@@ -2,7 +2,7 @@
 
 SOG looks up spherical harmonics in a table of up to 64 K entries, which k-means finds. On a processor splat-transform compares every splat with
 nearly every entry, ten times: hours for a table of that size. So without a GPU files are small, each with a small table of its own, and one
-iteration has to do; since it begins from the splats' own values, and a table has at least half as many entries as splats, few are rounded.
+iteration has to do: it begins from the splats' own values, and a table has at least half as many entries as splats.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 from mipmap_plugin.errors import OutputError
 from mipmap_plugin.formats.json_file import read_json
-from mipmap_plugin.formats.splat_transform import TOOL, graphics_card, refuse_exchange, table_options
+from mipmap_plugin.formats.splat_transform import TOOL, refuse_exchange
 from mipmap_plugin.progress import told
 
 # Thousands of splats in a file where there is no GPU: about 1 ms for each splat, at 4 as at 8; twice that at 16.
@@ -24,6 +24,9 @@ SMALL_FILE = 4
 
 # Thousands of splats, of all levels, below which a chunk is not split for its extent.
 SMALLEST_CHUNK = 1
+
+# Adapters that splat-transform lists beside GPUs, and that are processors.
+SOFTWARE = re.compile("llvmpipe|swiftshader|lavapipe|software|basic render", re.IGNORECASE)
 
 # A line of splat-transform when it begins a file.
 BEGUN = re.compile(r"\[(\d+)/(\d+)\] (?:\d+_\d+|env)$")
@@ -44,13 +47,27 @@ def write_streamed_sog(levels: Sequence[Path], output: Path, extent: int) -> Non
     `extent`: chunks larger than this, in world units, are split. Raises SettingsError without splat-transform, OutputError.
     """
     tool = refuse_exchange(output)
-    card = graphics_card(tool)
+    card = _graphics_card(tool)
     small = [] if card else ["--lod-chunk-count", str(SMALL_FILE)]
     chunks = ["--lod-chunk-extent", str(extent), "--lod-chunk-min", str(SMALLEST_CHUNK)]
     inputs = [word for number, file in enumerate(levels) for word in (str(file), "--tag-lod", str(number))]
-    command = [*tool, "--no-tty", "--overwrite", *table_options(card), *small, *chunks, *inputs, str(output)]
+    command = [*tool, "--no-tty", "--overwrite", *_table_options(card), *small, *chunks, *inputs, str(output)]
     if reason := _followed(command) or ("" if output.is_file() else "it wrote nothing"):
         raise OutputError(f"{output}: {TOOL} does not write it ({reason})")
+
+
+def _graphics_card(tool: Sequence[str]) -> str:
+    """The number of the first GPU that splat-transform lists; empty if there is none."""
+    try:
+        listed = subprocess.run([*tool, "--list-gpus"], capture_output=True, text=True, errors="replace", timeout=60, check=False).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return next((number for number, name in re.findall(r"^\[(\d+)\] (.*)$", listed, re.MULTILINE) if not SOFTWARE.search(name)), "")
+
+
+def _table_options(card: str) -> list[str]:
+    """How SOG's table of spherical harmonics is found: on the GPU of that number; without one, in a single iteration, for each takes minutes."""
+    return ["--gpu", card] if card else ["--gpu", "cpu", "--sh-iterations", "1"]
 
 
 def read_chunks(file: Path) -> list[Chunk]:

@@ -1,0 +1,147 @@
+"""SOG and SPZ keep as much of splats as these formats have room for."""
+
+import gzip
+import io
+import json
+import struct
+import zipfile
+
+import numpy as np
+import pytest
+import tiny
+from PIL import Image
+
+from mipmap_plugin.formats.codebooks import codebook, palette
+from mipmap_plugin.formats.sog import write_sog
+from mipmap_plugin.formats.spz import refine_harmonics
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.vanilla import VanillaModel
+
+
+def columns_of(count=300, degree=3, seed=0):
+    """Splats as a capture has them: a few large ones, many small ones."""
+    draw = np.random.default_rng(seed)
+    names = [*"xyz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(3 * ((degree + 1) ** 2 - 1)))]
+    columns = {name: draw.normal(0, 0.3, count) for name in [*names, *(f"rot_{i}" for i in range(4))]}
+    columns |= {f"scale_{i}": draw.normal(-7, 1, count) + 9 * (np.arange(count) < 5) for i in range(3)}
+    return {name: column.astype(np.float32) for name, column in (columns | {"opacity": draw.normal(0, 2, count)}).items()}
+
+
+def as_rgba(webp):
+    return np.asarray(Image.open(io.BytesIO(webp)).convert("RGBA")).astype(int)
+
+
+def read_sog(path):
+    """The columns of a SOG, by its specification, and its meta.json."""
+    with zipfile.ZipFile(path) as archive:
+        meta = json.loads(archive.read("meta.json"))
+        assert all(info.compress_type == zipfile.ZIP_STORED for info in archive.infolist())
+        images = {name: as_rgba(archive.read(name)) for name in archive.namelist() if name.endswith("webp")}
+    flat = {name: image.reshape(-1, 4)[: meta["count"]] for name, image in images.items()}
+    low, high = (np.array(meta["means"][end]) for end in ("mins", "maxs"))
+    logs = low + (high - low) * (flat["means_l.webp"] + 256 * flat["means_u.webp"])[:, :3] / 65535
+    found = dict(zip("xyz", (np.sign(logs) * np.expm1(np.abs(logs))).T, strict=True))
+    scales, colors = (np.array(meta[part]["codebook"])[flat[f"{part}.webp"][:, :3]] for part in ("scales", "sh0"))
+    found |= {f"{name}_{i}": values[:, i] for name, values in (("scale", scales), ("f_dc", colors)) for i in range(3)}
+    found["alpha"] = flat["sh0.webp"][:, 3] / 255
+    three = (flat["quats.webp"][:, :3] / 255 - 0.5) * np.sqrt(2)
+    left = np.sqrt(np.maximum(0, 1 - (three**2).sum(1)))
+    found["quats"] = np.stack([np.insert(own, tag, value) for own, tag, value in zip(three, flat["quats.webp"][:, 3] - 252, left, strict=True)])
+    if "shN" in meta:
+        each = (meta["shN"]["bands"] + 1) ** 2 - 1
+        table = np.array(meta["shN"]["codebook"])[images["shN_centroids.webp"].reshape(-1, each, 4)[: meta["shN"]["count"], :, :3]]
+        labels = flat["shN_labels.webp"][:, 0] + 256 * flat["shN_labels.webp"][:, 1]
+        found |= {f"f_rest_{i}": rest for i, rest in enumerate(table[labels].swapaxes(1, 2).reshape(meta["count"], -1).T)}
+    return found, meta
+
+
+def matched(columns, found):
+    """The rows of a file in the order of its splats."""
+    places, read = (np.stack([rows[axis] for axis in "xyz"], 1) for rows in (columns, found))
+    nearest = ((places[:, None] - read[None]) ** 2).sum(2).argmin(1)
+    assert len(set(nearest)) == len(places)
+    return {name: column[nearest] for name, column in found.items()}
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_sog_holds_splats_rounded_to_the_nearest(tmp_path, degree):
+    columns = columns_of(degree=degree)
+    write_sog(tmp_path / "a.sog", columns, antialiased=degree == 1)
+    found, meta = read_sog(tmp_path / "a.sog")
+    assert meta.get("model") == ("antialiased" if degree == 1 else None) and ("shN" in meta) == (degree > 0)
+    found = matched(columns, found)
+    alphas, error = 1 / (1 + np.exp(-columns["opacity"])), {name: np.abs(found[name] - columns[name]) for name in columns if name in found}
+    assert np.abs(found["alpha"] - alphas).max() < 0.501 / 255  # rounded, and not down
+    assert max(error[axis].max() for axis in "xyz") < 5e-5
+    quats = np.stack([columns[f"rot_{i}"] for i in range(4)], 1)
+    cosines = np.abs((found["quats"] * quats / np.linalg.norm(quats, axis=1, keepdims=True)).sum(1))
+    assert (1 - cosines).max() < 2.5e-5
+    rest = [error[f"f_rest_{i}"] for i in range(3 * ((degree + 1) ** 2 - 1))]
+    assert all(part.max() < 0.02 for part in rest)  # each splat has an entry of its own in the table
+    lengths = np.stack([error[f"scale_{i}"] for i in range(3)])
+    assert lengths[:, :5].max() < 1e-3 and lengths.max() < 0.1  # those that cover the picture are the most exact
+    write_sog(tmp_path / "b.sog", columns, antialiased=degree == 1)
+    assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
+
+
+@pytest.mark.parametrize("count", [1, 2, 17])
+def test_few_splats_and_equal_ones_are_kept_as_they_are(tmp_path, count):
+    columns = {name: np.full(count, column[0]) for name, column in columns_of(1).items()}
+    columns |= {f"rot_{i}": np.zeros(count, np.float32) for i in range(4)}
+    write_sog(tmp_path / "a.sog", columns, antialiased=False)
+    found, _ = read_sog(tmp_path / "a.sog")
+    kept = [name for name in columns if name in found]
+    assert all(np.allclose(found[name], columns[name], atol=1e-6) for name in kept) and len(kept) == 3 + 3 + 3 + 45
+    assert np.allclose(found["quats"], [[1, 0, 0, 0]], atol=0.01)
+
+
+def test_numbers_that_have_room_in_a_code_book_are_exact():
+    values = np.random.default_rng(0).normal(size=200)[np.random.default_rng(1).integers(0, 200, (500, 3))]
+    codes, labels = codebook(values, np.ones_like(values))
+    assert len(codes) == 256 and np.array_equal(codes[labels], values)
+
+
+def test_a_splat_without_thickness_takes_no_codes_from_others(tmp_path):
+    columns = columns_of()
+    columns["scale_0"][::3] = -87
+    write_sog(tmp_path / "a.sog", columns, antialiased=False)
+    found = matched(columns, read_sog(tmp_path / "a.sog")[0])
+    assert np.abs(found["scale_1"] - columns["scale_1"]).max() < 0.15 and (found["scale_0"] - found["scale_1"])[::3].max() < -8
+
+
+def test_a_palette_with_too_little_room_is_closest_where_the_weight_is():
+    draw = np.random.default_rng(0)
+    vectors, weights = draw.normal(size=(2000, 9)).astype(np.float32), np.ones(2000)
+    weights[:100] = 1000
+    entries, labels = palette(vectors, weights, 400)
+    error = ((entries[labels] - vectors) ** 2).sum(1)
+    assert len(entries) <= 400 and error[:100].mean() < 0.5 < error.mean() < 5
+    assert np.array_equal(palette(vectors, weights, 400)[1], labels)
+
+
+def test_an_spz_has_its_harmonics_in_8_bits(tmp_path):
+    columns = columns_of(20, degree=2)
+    body = bytes(range(20 * 20 % 256)) + bytes(20 * (9 + 1 + 3 + 3 + 4) - 20 * 20 % 256)
+    content = struct.pack("<4sIIBBBB", b"NGSP", 3, 20, 2, 12, 1, 0) + body
+    (tmp_path / "a.spz").write_bytes(gzip.compress(content + bytes(20 * 24)))
+    refine_harmonics(tmp_path / "a.spz", columns)
+    written = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    assert written.startswith(content) and len(written) == len(content) + 20 * 24
+    rest = (np.frombuffer(written[len(content) :], np.uint8).reshape(20, 8, 3).astype(float) - 128) / 128
+    expected = np.stack([columns[f"f_rest_{i}"] for i in range(24)], 1).reshape(20, 3, 8).swapaxes(1, 2)
+    assert np.abs(rest - np.clip(expected, -1, 127 / 128)).max() <= 0.5 / 128 + 1e-6
+
+
+def test_saving_writes_so(tmp_path, tool):
+    model = VanillaModel.from_gaussians(tiny.gaussians(), trained=TrainedScale("antialiased"))
+    model.save(tmp_path / "a.sog", provenance={})
+    found, meta = read_sog(tmp_path / "a.sog")
+    assert meta["count"] == len(model) and meta["model"] == "antialiased"
+    assert np.allclose(np.sort(found["x"]), model.parameters()["means"][:, 0].sort().values, atol=1e-3)
+    count, degree = len(model), model.sh_degree
+    spz = gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, count, degree, 12, 1, 0) + bytes(count * (20 + 3 * ((degree + 1) ** 2 - 1))))
+    with (tool / "splat-transform").open("a") as script:
+        script.write(f"pathlib.Path(target).write_bytes({spz!r})\n")
+    model.save(tmp_path / "a.spz", provenance={})
+    last = gzip.decompress((tmp_path / "a.spz").read_bytes())[-1]
+    assert abs((last - 128) / 128 - float(model.parameters()["shN"][-1, -1, -1])) <= 0.5 / 128 + 1e-6
