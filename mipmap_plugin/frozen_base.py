@@ -7,9 +7,10 @@ from contextlib import nullcontext
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, SupportsIndex, TypedDict, cast
+from typing import Any, SupportsIndex, cast
 
 import torch
+from typing_extensions import TypedDict, Unpack
 
 from mipmap_plugin.adaptation import notebook
 from mipmap_plugin.adaptation.adapted import Adapted, as_start, render_model
@@ -44,9 +45,6 @@ from mipmap_plugin.scenes import Scene
 from mipmap_plugin.screen_filters import DILATION, USUAL_EPS2D, check_screen_filter
 from mipmap_plugin.splatting.filters import INTEGRALS
 from mipmap_plugin.splatting.viewers import find_viewer, own_name, viewers_for
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 
 class RenderOptions(TypedDict, total=False):

@@ -8,8 +8,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import Any
 from warnings import warn
+
+from typing_extensions import TypedDict, Unpack
 
 from mipmap_plugin.adaptation.adapted import Adapted as Adapted
 from mipmap_plugin.adaptation.cameras_of_base import own_cameras, where
@@ -20,6 +22,7 @@ from mipmap_plugin.camera import Camera, digest_of, of_base_scale
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.frozen_base import RenderOptions as RenderOptions
+from mipmap_plugin.levels.finished import Ladder
 from mipmap_plugin.limits import check_background, check_kinds, check_names, path_of
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.adapted_scale import exporter, known_up
@@ -31,11 +34,6 @@ from mipmap_plugin.process.torch_modes import usual_modes
 from mipmap_plugin.scenes import Scene, load_scene
 from mipmap_plugin.scenes.orbits import AXES
 from mipmap_plugin.screen_filters import USUAL_EPS2D, check_screen_filter
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
-    from mipmap_plugin.levels.finished import Ladder
 
 
 class WrapOptions(TypedDict, total=False):
