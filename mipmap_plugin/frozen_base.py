@@ -19,7 +19,7 @@ from mipmap_plugin.adaptation.conversion import Stages, conversion
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import LIMIT, BaseImages
-from mipmap_plugin.adaptation.target.photographs import Photographs, placed
+from mipmap_plugin.adaptation.target.photographs import Photographs, placed, scene_of
 from mipmap_plugin.adaptation.target.portable import settings_for_several
 from mipmap_plugin.adaptation.viewpoints import ClearViews, Viewpoints, orbit_of
 from mipmap_plugin.adaptation.views import choose_views, refuse_blind
@@ -159,7 +159,7 @@ class FrozenBase:
         cameras: Sequence[Camera] | None = None,
         resume: str | Path | None = None,
         observe: Observer | None = None,
-        images: Scene | None = None,
+        images: Scene | str | Path | None = None,
         start: FinerLevel | Adapted | None = None,
         **settings: Any,
     ) -> Adapted:
@@ -172,23 +172,24 @@ class FrozenBase:
         and raises Interrupted, a long run writes it every minute, and saving the model removes it. `observe(step, seconds, render)` is
         called before the first step and after each (of the conversion before a zoom-in, too: `adaptation.conversion`); `render(camera)` is
         the current image [H, W, 3], without gradients, and the run ends where it returns True.
-        `images`: a scene whose training images are the truth of a zoom-in, instead of the base's renders of these views.
+        `images`: a scene, or its path, whose training images are the truth of a zoom-in, instead of the base's renders of these views.
         `start`: a model adapted for the same viewer to a finer scale, to start from instead of from the base. While it runs, torch's default dtype is
         float32, and torch may have one thread, in the whole process: torch has one of each. Raises SettingsError and BackendUnavailable.
         """
         scale, cameras = check_scale(scale), None if cameras is None else of_base_scale(cameras, some=True)
         finer = as_start(start, viewer)
-        check_kinds(images=(images, Scene), observe=(observe, Callable))
+        check_kinds(observe=(observe, Callable))
+        scene = None if images is None else scene_of(self.model, images)
         state = None if resume is None else path_of(resume, "resume")
         model = self._fused if viewer is not None and self.model.traits.filtered else self.model
         settings = mergeable_settings(model, settings)
-        if images is not None and self.model.traits.exposures.changed:
+        if scene and self.model.traits.exposures.changed:
             raise SettingsError("the images were exposed differently, which adaptation does not support (exposure.json); leave them out")
         config, targets = self._planned(recipe, scale, viewer, settings)
         first = conversion(config, self.effects(), targets.values(), scale) if finer is None else None
         views = {} if cameras is None else {"views": digest_of(cameras)}
-        inputs = self.asked | views | ({} if images is None else {"photographs": images.digest()})
-        photographs = None if images is None else Photographs(self.place(images), self.cameras, self.background)
+        inputs = self.asked | views | ({"photographs": scene.digest()} if scene else {})
+        photographs = Photographs(self.place(scene), self.cameras, self.background) if scene else None
         if cameras is None:
             cameras = photographs.cameras if photographs else self.cameras
         needs = [replace(self._needs, screen_filter=target.screen_filter, settings=target.settings) for target in targets.values()]

@@ -27,8 +27,8 @@ OPTIONS = "cfg_args"
 COLMAP_FILES = {f"{name}{suffix}" for name in ("cameras", "images", "points3D", "frames", "rigs") for suffix in (".bin", ".txt")}
 
 __all__ = [
-    "Scene", "cameras_in", "jittered", "load_photographs", "load_scene", "model_cameras", "orbit", "read_cameras", "read_colmap", "read_transforms",
-    "unread_cameras", "write_cameras",
+    "DEFORMABLE", "Scene", "cameras_in", "jittered", "load_photographs", "load_scene", "model_cameras", "orbit", "read_cameras", "read_colmap",
+    "read_transforms", "unread_cameras", "write_cameras",
 ]  # fmt: skip
 
 
