@@ -39,7 +39,7 @@ from mipmap_plugin.models.outputs import parts_of
 from mipmap_plugin.models.places import REPORT, state_path
 from mipmap_plugin.plugin_errors import naming_any, unchanged
 from mipmap_plugin.process import threads
-from mipmap_plugin.process.torch_modes import usual_modes
+from mipmap_plugin.process.torch_modes import in_usual_modes
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.screen_filters import DILATION, USUAL_EPS2D, check_screen_filter
@@ -113,7 +113,7 @@ class FrozenBase:
             return str(error)
         return ""
 
-    @usual_modes()
+    @in_usual_modes
     def render(
         self,
         camera: Camera,
@@ -149,7 +149,7 @@ class FrozenBase:
         scales, opacities = smooth_3d(gaussians.scales, gaussians.opacities, filter_3d_of(gaussians.means, self.cameras))
         return replace(gaussians, scales=scales, opacities=opacities)
 
-    @usual_modes()
+    @in_usual_modes
     def adapt(
         self,
         scale: float,
@@ -264,7 +264,7 @@ class FrozenBase:
         reads_all = viewer is None or not self.model.traits.filtered or all(find_viewer(name).filter_3d for name in viewers_for(viewer))
         return self.model if reads_all else cast(Filtered, self.model).bare()
 
-    @usual_modes()
+    @in_usual_modes
     def views(self) -> list[Camera]:
         """The checkpoint's cameras, or a generated orbit, for an adapted file that of its base, if it came without any."""
         return self.cameras or choose_views([], replace(self.viewpoints, clear=list), AdaptConfig())[0]

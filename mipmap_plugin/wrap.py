@@ -30,7 +30,7 @@ from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.process.threads import checked as checked_threads
-from mipmap_plugin.process.torch_modes import usual_modes
+from mipmap_plugin.process.torch_modes import in_usual_modes
 from mipmap_plugin.scenes import Scene, load_scene
 from mipmap_plugin.scenes.orbits import AXES
 from mipmap_plugin.screen_filters import USUAL_EPS2D, check_screen_filter
@@ -47,7 +47,7 @@ class WrapOptions(TypedDict, total=False):
 class Wrapped(FrozenBase):
     """A frozen base model with its cameras, ready to be adapted to any scale and made into levels. It never changes."""
 
-    @usual_modes()
+    @in_usual_modes
     def levels(self, viewer: str, *, resume: str | Path | None = None, **options: Any) -> Ladder:
         """Return a ladder of levels (`levels.finished.Ladder`), to be saved with `save(folder)`. `options`: those of `LadderRequest.of`."""
         from mipmap_plugin.levels.ladder import make_levels
@@ -56,7 +56,7 @@ class Wrapped(FrozenBase):
         return make_levels(self, LadderRequest.of(viewer, **options), resume)
 
 
-@usual_modes()
+@in_usual_modes
 def wrap_model(
     model: SplatModel | str | Path | Any,
     *,
