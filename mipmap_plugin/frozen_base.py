@@ -7,9 +7,10 @@ from contextlib import nullcontext
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, SupportsIndex, TypedDict, cast
+from typing import Any, SupportsIndex, cast
 
 import torch
+from typing_extensions import TypedDict, Unpack
 
 from mipmap_plugin.adaptation import notebook
 from mipmap_plugin.adaptation.adapted import Adapted, as_start, render_model
@@ -19,7 +20,7 @@ from mipmap_plugin.adaptation.in_viewers import NearPlanes
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import LIMIT, BaseImages
-from mipmap_plugin.adaptation.target.photographs import Photographs, placed
+from mipmap_plugin.adaptation.target.photographs import Photographs, placed, scene_of
 from mipmap_plugin.adaptation.target.portable import settings_for_several
 from mipmap_plugin.adaptation.viewpoints import ClearViews, Viewpoints, orbit_of
 from mipmap_plugin.adaptation.views import choose_views, refuse_blind, refuse_large
@@ -39,15 +40,12 @@ from mipmap_plugin.models.outputs import parts_of
 from mipmap_plugin.models.places import REPORT, state_path
 from mipmap_plugin.plugin_errors import naming_any, unchanged
 from mipmap_plugin.process import threads
-from mipmap_plugin.process.torch_modes import usual_modes
+from mipmap_plugin.process.torch_modes import in_usual_modes
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.screen_filters import DILATION, USUAL_EPS2D, check_screen_filter
 from mipmap_plugin.splatting.filters import INTEGRALS
 from mipmap_plugin.splatting.viewers import find_viewer, own_name, viewers_for
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 
 class RenderOptions(TypedDict, total=False):
@@ -116,7 +114,7 @@ class FrozenBase:
             return str(error)
         return ""
 
-    @usual_modes()
+    @in_usual_modes
     def render(
         self,
         camera: Camera,
@@ -152,7 +150,7 @@ class FrozenBase:
         scales, opacities = smooth_3d(gaussians.scales, gaussians.opacities, filter_3d_of(gaussians.means, self.cameras))
         return replace(gaussians, scales=scales, opacities=opacities)
 
-    @usual_modes()
+    @in_usual_modes
     def adapt(
         self,
         scale: float,
@@ -162,7 +160,7 @@ class FrozenBase:
         cameras: Sequence[Camera] | None = None,
         resume: str | Path | None = None,
         observe: Observer | None = None,
-        images: Scene | None = None,
+        images: Scene | str | Path | None = None,
         start: FinerLevel | Adapted | None = None,
         **settings: Any,
     ) -> Adapted:
@@ -175,24 +173,25 @@ class FrozenBase:
         and raises Interrupted, a long run writes it every minute, and saving the model removes it. `observe(step, seconds, render)` is
         called before the first step and after each (of the conversion before a zoom-in, too: `adaptation.conversion`); `render(camera)` is
         the current image [H, W, 3], without gradients, and the run ends where it returns True.
-        `images`: a scene whose training images are the truth of a zoom-in, instead of the base's renders of these views.
+        `images`: a scene, or its path, whose training images are the truth of a zoom-in, instead of the base's renders of these views.
         `start`: a model adapted for the same viewer to a finer scale, to start from instead of from the base. While it runs, torch's default dtype is
         float32, and torch may have one thread, in the whole process: torch has one of each. Raises SettingsError and BackendUnavailable.
         """
         scale, cameras = check_scale(scale), None if cameras is None else of_base_scale(cameras, some=True)
         finer = as_start(start, viewer)
-        check_kinds(images=(images, Scene), observe=(observe, Callable))
+        check_kinds(observe=(observe, Callable))
+        scene = None if images is None else scene_of(self.model, images)
         state = None if resume is None else path_of(resume, "resume")
         model = self._fused if viewer is not None and self.model.traits.filtered else self.model
         settings = mergeable_settings(model, settings)
-        if images is not None and self.model.traits.exposures.changed:
+        if scene and self.model.traits.exposures.changed:
             raise SettingsError("the images were exposed differently, which adaptation does not support (exposure.json); leave them out")
-        scene = None if images is None else self.place(images)
+        there = self.place(scene) if scene else None
         config, targets = self._planned(recipe, scale, viewer, settings, cameras or ())
         first = conversion(config, self.effects(), targets.values(), scale) if finer is None else None
         views = {} if cameras is None else {"views": digest_of(cameras)}
-        inputs = self.asked | views | ({} if images is None else {"photographs": images.digest()})
-        photographs = None if scene is None else Photographs(scene, self.cameras, self.background)
+        inputs = self.asked | views | ({"photographs": scene.digest()} if scene else {})
+        photographs = Photographs(there, self.cameras, self.background) if there else None
         cameras = (photographs or self).cameras if cameras is None else cameras
         needs = [replace(self._needs, screen_filter=target.screen_filter, settings=target.settings) for target in targets.values()]
         backend, note, has_gradients = choose(self._backend, config, needs, self._needs)
@@ -266,7 +265,7 @@ class FrozenBase:
         reads_all = viewer is None or not self.model.traits.filtered or all(find_viewer(name).filter_3d for name in viewers_for(viewer))
         return self.model if reads_all else cast(Filtered, self.model).bare()
 
-    @usual_modes()
+    @in_usual_modes
     def views(self) -> list[Camera]:
         """The checkpoint's cameras, or a generated orbit, for an adapted file that of its base, if it came without any."""
         return self.cameras or choose_views([], replace(self.viewpoints, clear=list), AdaptConfig())[0]

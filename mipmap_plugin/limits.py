@@ -52,9 +52,7 @@ def check_kinds(**given: tuple[Any, Any]) -> None:
     """Raise SettingsError for arguments, by name, that are neither None nor of the kind that each has to be."""
     for name, (value, kind) in given.items():
         if value is not None and not isinstance(value, kind):
-            wanted = getattr(kind, "__name__", kind)
-            hint = "; load_scene(path) reads one" if wanted == "Scene" else ""
-            raise SettingsError(f"{name} must be a {wanted}, got {type(value).__name__}{hint}")
+            raise SettingsError(f"{name} must be a {getattr(kind, '__name__', kind)}, got {type(value).__name__}")
 
 
 def check_names(function: str, options: Mapping[str, Any], kind: type, beside: Sequence[str]) -> None:

@@ -8,8 +8,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import Any
 from warnings import warn
+
+from typing_extensions import TypedDict, Unpack
 
 from mipmap_plugin.adaptation.adapted import Adapted as Adapted
 from mipmap_plugin.adaptation.cameras_of_base import own_cameras, where
@@ -20,6 +22,7 @@ from mipmap_plugin.camera import Camera, digest_of, of_base_scale
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.frozen_base import RenderOptions as RenderOptions
+from mipmap_plugin.levels.finished import Ladder
 from mipmap_plugin.limits import check_background, check_kinds, check_names, path_of
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.adapted_scale import exporter, known_up
@@ -27,15 +30,10 @@ from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.process.threads import checked as checked_threads
-from mipmap_plugin.process.torch_modes import usual_modes
+from mipmap_plugin.process.torch_modes import in_usual_modes
 from mipmap_plugin.scenes import Scene, load_scene
 from mipmap_plugin.scenes.orbits import AXES
 from mipmap_plugin.screen_filters import USUAL_EPS2D, check_screen_filter
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
-    from mipmap_plugin.levels.finished import Ladder
 
 
 class WrapOptions(TypedDict, total=False):
@@ -49,7 +47,7 @@ class WrapOptions(TypedDict, total=False):
 class Wrapped(FrozenBase):
     """A frozen base model with its cameras, ready to be adapted to any scale and made into levels. It never changes."""
 
-    @usual_modes()
+    @in_usual_modes
     def levels(self, viewer: str, *, resume: str | Path | None = None, **options: Any) -> Ladder:
         """Return a ladder of levels (`levels.finished.Ladder`), to be saved with `save(folder)`. `options`: those of `LadderRequest.of`."""
         from mipmap_plugin.levels.ladder import make_levels
@@ -58,7 +56,7 @@ class Wrapped(FrozenBase):
         return make_levels(self, LadderRequest.of(viewer, **options), resume)
 
 
-@usual_modes()
+@in_usual_modes
 def wrap_model(
     model: SplatModel | str | Path | Any,
     *,

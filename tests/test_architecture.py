@@ -1,15 +1,20 @@
 """The house's own rules, read from the source: what may import what, and how large a thing may grow."""
 
 import ast
+import inspect
 import re
 import subprocess
 import sys
 from collections.abc import Callable
 from functools import cache
+from importlib import import_module
 from pathlib import Path
+from typing import get_type_hints
 
 import tiny
+from pydantic import validate_call
 
+import mipmap_plugin
 from mipmap_plugin.models import Traits, load_model
 
 PACKAGE = Path(__file__).parents[1] / "mipmap_plugin"
@@ -261,3 +266,20 @@ def test_the_library_neither_prints_nor_evaluates_text():
 def test_one_sentence_says_how_to_install_an_extra():
     """It is right in a clone too, from which the README installs."""
     assert [name_of(path) for path in MODULES if re.search(r"pip install '(mipmap-plugin|\.)\[", path.read_text(encoding="utf-8"))] == ["errors.py"]
+
+
+def test_annotations_of_stable_names_can_be_evaluated():
+    """By pydantic, jsonargparse, beartype and Sphinx: what is imported for type checkers alone is not there when they ask."""
+
+    def is_ours(thing: object) -> bool:
+        return callable(thing) and (getattr(thing, "__module__", None) or "").startswith(PACKAGE.name)
+
+    modules = ["", ".models", ".models.base", ".splatting.viewers", ".recipes", ".config", ".backends.base", ".scenes"]
+    named = [getattr(module, name) for module in [import_module(PACKAGE.name + name) for name in modules] for name in dir(module)]
+    public = [thing for thing in named if is_ours(thing)]
+    methods = [method for thing in public if isinstance(thing, type) for _, method in inspect.getmembers(thing, inspect.isfunction)]
+    assert {mipmap_plugin.Wrapped.render, mipmap_plugin.wrap_model} <= {*public, *methods}
+    for thing in [*public, *filter(is_ours, methods)]:
+        get_type_hints(thing)
+    for function in (mipmap_plugin.wrap_model, mipmap_plugin.Wrapped.render, mipmap_plugin.Wrapped.adapt):
+        validate_call(function, config={"arbitrary_types_allowed": True})

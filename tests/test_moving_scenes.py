@@ -13,8 +13,10 @@ import tiny
 import torch
 from PIL import Image
 
+from mipmap_plugin import wrap_model
+from mipmap_plugin.adaptation.target.photographs import scene_of
 from mipmap_plugin.commands.common import scene
-from mipmap_plugin.errors import SceneError
+from mipmap_plugin.errors import SceneError, SettingsError
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.finished import _inputs
 from mipmap_plugin.jobs.job import Job
@@ -175,12 +177,18 @@ def test_the_cameras_json_of_a_hypernerf_capture_has_its_test_views_first(tmp_pa
     assert [int(camera.name) for camera in found if camera.split == "test"] == tests
 
 
-def test_photographs_judge_a_deformable_checkpoint_in_its_own_frame(tmp_path):
-    """`evaluate`, `tradeoff`, and `adapt` with `--images`, here or as a job; at their full size, whatever `resolution` it was trained at."""
+@pytest.fixture
+def capture(tmp_path):
+    """Of HyperNeRF, as Deformable 3D Gaussians needs it."""
     path = hypernerf(tmp_path / "interp_aleks/s")
     (path / "metadata.json").write_text(json.dumps({f"{i:06d}": {"warp_id": i, "time_id": 3 * i} for i in range(9)}))
     (path / "scene.json").write_text(json.dumps({"scale": 0.25, "center": [0.5, -1.0, 2.0]}))
-    folder = moving.write_deformable(tmp_path / "model")
+    return path
+
+
+def test_photographs_judge_a_deformable_checkpoint_in_its_own_frame(capture, tmp_path):
+    """`evaluate`, `tradeoff`, and `adapt` with `--images`, here or as a job; at their full size, whatever `resolution` it was trained at."""
+    path, folder = capture, moving.write_deformable(tmp_path / "model")
     wanted = load_scene(path, {"is_6dof": False}).cameras
     (folder / "cfg_args").write_text((folder / "cfg_args").read_text().replace("(", "(resolution=2, "))
     base = Base(folder)
@@ -191,6 +199,18 @@ def test_photographs_judge_a_deformable_checkpoint_in_its_own_frame(tmp_path):
     job = Job(base, tmp_path / "out", 0.5, images=path)
     assert _inputs(job)["photographs"] == judged.digest()
     assert scene(Base(tiny.folder(tmp_path / "still")), path).digest() == load_scene(path).digest()
+
+
+def test_python_takes_the_path_of_photographs_as_commands_do(capture, tmp_path):
+    model = wrap_model(moving.write_deformable(tmp_path / "model"), cameras=capture, backend="reference")
+    right, other = load_scene(capture, {"is_6dof": False}), load_scene(capture)
+    assert all(torch.equal(one.viewmat, wanted.viewmat) for one, wanted in zip(model.cameras, right.cameras, strict=True))
+    assert [scene_of(model.model, images).digest() for images in (capture, str(capture), right)] == [right.digest()] * 3
+    assert model.place(right) is right
+    with pytest.raises(SettingsError, match="was read as 4DGaussians does, and Deformable 3D Gaussians, which trained this checkpoint, takes other"):
+        model.adapt(2, images=other)
+    with pytest.raises(SettingsError, match="give the path itself as images or cameras"):
+        wrap_model(model.model, cameras=other)
 
 
 def test_broken_ones_are_refused_in_one_sentence(tmp_path):

@@ -12,7 +12,7 @@ from torch_checkpoints import splats
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import digest_of
-from mipmap_plugin.errors import SceneError, SettingsError, ShapeError
+from mipmap_plugin.errors import MipmapPluginError, SceneError, SettingsError, ShapeError
 from mipmap_plugin.levels.finished import Ladder
 from mipmap_plugin.scenes import load_scene, write_cameras
 from mipmap_plugin.wrap import wrap_model
@@ -91,9 +91,13 @@ def test_an_adapted_model_may_be_what_a_coarser_one_starts_from(adapted):
         base.adapt(1 / 4, start=base)
 
 
-def test_a_path_of_photographs_is_told_what_reads_it():
-    with pytest.raises(SettingsError, match=r"images must be a Scene, got str; load_scene\(path\) reads one$"):
-        wrap_model(tiny.model(10), cameras=tiny.cameras()).adapt(2, images="scene")
+@pytest.mark.parametrize(("images", "sentence"), [
+    ("nowhere", "nowhere: there is no such file or folder"),
+    (3, "images must be the path of the photographs' scene, or a Scene, got an int"),
+])  # fmt: skip
+def test_what_is_no_scene_of_photographs_is_refused(images, sentence):
+    with pytest.raises(MipmapPluginError, match=sentence):
+        wrap_model(tiny.model(10), cameras=tiny.cameras()).adapt(2, images=images)
 
 
 @pytest.mark.parametrize(("change", "sentence"), [

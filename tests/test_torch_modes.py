@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import runpy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
@@ -14,7 +14,9 @@ from torch_checkpoints import gsplat_folder
 
 import mipmap_plugin.camera
 import mipmap_plugin.models.surfels
-from mipmap_plugin import load_model, load_scene
+from mipmap_plugin import Effects, load_model, load_scene
+from mipmap_plugin.backends.cpu import CpuBackend
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models.surfels import FLAT
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.process.torch_modes import usual_modes
@@ -122,3 +124,21 @@ def test_products_of_matrices_are_exact_whatever_the_caller_has_set(precision: s
         assert precisions() == asked != before
     finally:
         torch.set_float32_matmul_precision("highest")
+
+
+def test_the_compiler_passes_over_what_it_cannot_trace() -> None:
+    model, camera = wrap_model(tiny.model(10), cameras=CAMERAS, backend="cpu"), CAMERAS[0]
+    compiled = torch.compile(lambda factor: factor * model.render(camera).image, backend="eager")
+    assert torch.equal(compiled(torch.tensor(2.0)), 2 * model.render(camera).image)
+
+
+@pytest.mark.parametrize("transform", [torch.func.grad, torch.func.vmap, torch.func.jacrev])
+def test_transforms_of_functions_are_refused_in_a_sentence(transform: Callable[..., Callable[..., torch.Tensor]]) -> None:
+    model, splats, camera = wrap_model(tiny.model(10), cameras=CAMERAS), tiny.gaussians(10), CAMERAS[0]
+    calls: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
+        "adapt": lambda factor: factor * model.adapt(0.5).render(camera).image.sum(),
+        "render": lambda factor: (factor * CpuBackend().render(splats, camera, Effects(1)).image).sum(),
+    }
+    for name, call in calls.items():
+        with pytest.raises(SettingsError, match=rf"^{name} cannot be transformed by torch\.func .*; call it outside of the transform, or use"):
+            transform(call)(torch.tensor([1.0, 2.0]) if transform is torch.func.vmap else torch.tensor(1.0))

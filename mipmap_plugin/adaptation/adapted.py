@@ -33,7 +33,7 @@ from mipmap_plugin.models.mip import for_loader_of
 from mipmap_plugin.models.outputs import drawn_otherwise, parts_of, without_place
 from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.plugin_errors import naming_any, unchanged
-from mipmap_plugin.process.torch_modes import usual_modes
+from mipmap_plugin.process.torch_modes import in_usual_modes, usual_modes
 from mipmap_plugin.progress import announced
 
 
@@ -65,7 +65,7 @@ class Adapted:
     judge: Validation | None = None
     written: dict[Path, dict[str, Any]] = field(default_factory=dict)
 
-    @usual_modes()
+    @in_usual_modes
     def render(self, camera: Camera, *, outputs: Sequence[str] | None = (), exposure: bool = False, viewer: str | None = None) -> Rendered:
         """Render the view of a camera of the new scale, in one of the `viewers`; `outputs` and `exposure` as in `Wrapped.render`."""
         [camera] = checked([camera])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -223,6 +223,7 @@ class Stepper(Protocol):
         """
 
 
+@runtime_checkable
 class Backend(Protocol):
     """Renders Gaussians to an image with one sample per pixel; supersampling, depth and normals are built on top (`supersample`, `geometry`).
 

@@ -19,6 +19,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable, brief, install
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.process.torch_modes import opaque
 from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.screen_filters import INTEGRATED
 from mipmap_plugin.splatting.buckets import ranks_for
@@ -53,12 +54,14 @@ class CpuBackend:
         unsupported = [f"it draws the screen filter {needs.screen_filter} with the usual cut-offs only"] if changed else []
         return self.capabilities.lacking(needs) + unsupported or missing()
 
+    @opaque
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         """The view of `camera`. Raises BackendUnavailable, an ImportError, if numba is missing or the request is not supported."""
         if effects.settings.linear_light is not None:
             return in_linear_light(self.render, gaussians, camera, effects)
         return self._drawn(gaussians, [(camera, effects)])[0]
 
+    @opaque
     def render_views(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
         """Several views of the same splats, each with effects of its own, in one call. Raises as `render`."""
         if any(effects.settings.by_view for _, effects in shots):

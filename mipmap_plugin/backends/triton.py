@@ -30,6 +30,7 @@ from mipmap_plugin.backends.linear_light import in_linear_light
 from mipmap_plugin.camera import ONE_PIXEL, Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.process.torch_modes import opaque
 from mipmap_plugin.splatting.buckets import ranks_of_views
 from mipmap_plugin.splatting.packing import packed
 
@@ -65,6 +66,7 @@ class TritonBackend:
         """The reasons why this backend cannot serve `needs`; empty if it can."""
         return missing() + self.capabilities.lacking(needs)
 
+    @opaque
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         """The view of `camera`. Raises BackendUnavailable, an ImportError, if this backend cannot serve the request.
 
@@ -74,6 +76,7 @@ class TritonBackend:
             return in_linear_light(self.render, gaussians, camera, effects)
         return self.render_views(gaussians, [(camera, effects)])[0]
 
+    @opaque
     def render_views(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
         """Several views of the same splats, each with effects of its own, by one launch of each kernel; of packed splats, which depend on the
         camera, one by one, and in linear light too. Raises as `render`."""

@@ -12,7 +12,7 @@ from mipmap_plugin.levels.contents import Contents, Level
 from mipmap_plugin.levels.distance.manifest import Contents as DistanceContents
 from mipmap_plugin.levels.store import LevelStore
 from mipmap_plugin.limits import path_of
-from mipmap_plugin.process.torch_modes import usual_modes
+from mipmap_plugin.process.torch_modes import in_usual_modes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -31,7 +31,7 @@ class Ladder:
         """From the finest to the coarsest."""
         return self.contents.levels
 
-    @usual_modes()
+    @in_usual_modes
     def save(self, folder: str | Path, *, overwrite: bool = False, keep_resume: bool = False) -> Path:
         """Write the levels and the manifest `levels.json` to a folder, atomically; return it. Raises OutputExists, OutputError.
 

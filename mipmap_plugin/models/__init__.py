@@ -6,6 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import mipmap_plugin.models  # through which annotations that are evaluated find SplatModel, without importing it before
 from mipmap_plugin.errors import CheckpointError, MipmapPluginError, PluginError
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.detect import Checkpoint, detect
@@ -48,7 +49,7 @@ def __getattr__(name: str) -> Any:
     return getattr(import_module(f"{__name__}.base"), name)
 
 
-def load_model(path: str | Path, *, iteration: int | None = None) -> SplatModel:
+def load_model(path: str | Path, *, iteration: int | None = None) -> mipmap_plugin.models.SplatModel:
     """Load a checkpoint: a PLY, or a model folder (its newest complete iteration, or `iteration`).
 
     Raises CheckpointError for a path that is missing, damaged, not a checkpoint, or of a family that is not loaded; PluginError if a

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -93,6 +93,7 @@ class Traits:
 PARAMETERS = ("means", "scales", "quats", "opacities", "sh0", "shN", "offsets", "features", CARRIED)
 
 
+@runtime_checkable  # for tools that check arguments by their annotations, such as pydantic
 class SplatModel(Protocol):
     """What every model provides to be rendered, adapted and saved. A Protocol: plug-ins need no base class.
 

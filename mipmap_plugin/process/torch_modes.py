@@ -1,14 +1,19 @@
-"""Torch's modes that a caller may have set: they would change results here, or break operations in place."""
+"""Torch's modes that a caller may have set: they would change results here, or break operations in place. And its compiler and transforms."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from functools import partial
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from functools import partial, wraps
 from threading import Lock
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import torch
+
+from mipmap_plugin.errors import SettingsError
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 # What torch says of a precision that nobody set: float32.
 UNSET = "none"
@@ -17,7 +22,7 @@ UNSET = "none"
 @contextmanager
 def usual_modes() -> Iterator[None]:
     """Inside, there is no autocast and no inference mode, new tensors are of float32 and on the processor by default, and products of matrices
-    are exact to float32. Also a decorator."""
+    are exact to float32."""
     with ExitStack() as stack:
         for kind in ("cpu", "cuda"):
             if torch.is_autocast_enabled(kind):
@@ -30,6 +35,31 @@ def usual_modes() -> Iterator[None]:
             setting.enter()
             stack.callback(setting.leave)
         yield
+
+
+def opaque(function: Callable[P, T], modes: Callable[[], AbstractContextManager[None]] = nullcontext) -> Callable[P, T]:
+    """The function, which torch.compile runs as it is, and torch.func refuses with a SettingsError: neither can look into compiled kernels.
+
+    `modes`: a context that it runs in.
+    """
+
+    @wraps(function)
+    def called(*args: P.args, **kwargs: P.kwargs) -> T:
+        if torch._C._are_functorch_transforms_active():
+            advice = "call it outside of the transform, or use torch.autograd.grad"
+            raise SettingsError(f"{function.__name__} cannot be transformed by torch.func (grad, vmap, jvp, ...); {advice}")
+        if torch.compiler.is_compiling():  # only then: to ask for it ahead would import the compiler, which takes seconds
+            disabled: Callable[P, T] = torch.compiler.disable(called)
+            return disabled(*args, **kwargs)
+        with modes():
+            return function(*args, **kwargs)
+
+    return called
+
+
+def in_usual_modes(function: Callable[P, T]) -> Callable[P, T]:
+    """The function, which runs in `usual_modes` and is `opaque`."""
+    return opaque(function, usual_modes)
 
 
 class _Shared:

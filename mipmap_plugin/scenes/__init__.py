@@ -10,7 +10,7 @@ from mipmap_plugin.errors import CheckpointError, SceneError
 from mipmap_plugin.formats.cfg_args import read_cfg_args
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.limits import path_of
-from mipmap_plugin.process.torch_modes import usual_modes
+from mipmap_plugin.process.torch_modes import in_usual_modes
 from mipmap_plugin.scenes.base import Scene
 from mipmap_plugin.scenes.cameras_json import DEFORMABLE, read_cameras, write_cameras
 from mipmap_plugin.scenes.colmap import UNBENT, is_colmap, read_colmap, unbent_by
@@ -27,12 +27,12 @@ OPTIONS = "cfg_args"
 COLMAP_FILES = {f"{name}{suffix}" for name in ("cameras", "images", "points3D", "frames", "rigs") for suffix in (".bin", ".txt")}
 
 __all__ = [
-    "Scene", "cameras_in", "jittered", "load_photographs", "load_scene", "model_cameras", "orbit", "read_cameras", "read_colmap", "read_transforms",
-    "unread_cameras", "write_cameras",
+    "DEFORMABLE", "Scene", "cameras_in", "jittered", "load_photographs", "load_scene", "model_cameras", "orbit", "read_cameras", "read_colmap",
+    "read_transforms", "unread_cameras", "write_cameras",
 ]  # fmt: skip
 
 
-@usual_modes()
+@in_usual_modes
 def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     """The scene at `path`: a model folder with a cameras.json, that file itself, a transforms file of any name or its folder, a COLMAP
     scene, one of DyNeRF or HyperNeRF as 4DGaussians reads them, or a PLY that has a camera in it (`cameras_in`).

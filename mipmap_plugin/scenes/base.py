@@ -41,6 +41,7 @@ class Scene:
         applied_scale: The scale that it applied then.
         lenses: Of photographs that have to be undistorted.
         numbers: COLMAP's numbers of the cameras' images, in whatever order they were found; () elsewhere.
+        as_4dgaussians: It is a capture that Deformable 3D Gaussians, too, is trained on, but was read as 4DGaussians does (`scenes.moving`).
     """
 
     cameras: tuple[Camera, ...]
@@ -52,6 +53,7 @@ class Scene:
     applied_scale: float = 1.0
     lenses: dict[Path, Lens] = field(default_factory=dict)
     numbers: tuple[int, ...] = ()
+    as_4dgaussians: bool = False
 
     def digest(self) -> str:
         """A hash of the cameras and of the photographs: of their names and sizes in bytes, not of what they show."""

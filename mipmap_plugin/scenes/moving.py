@@ -68,7 +68,7 @@ def read_dynerf(path: Path, cfg: dict[str, Any] | None = None) -> Scene:
             if is_file(frame := path / video / "images" / f"{moment:04d}.png"):
                 images[camera] = frame
     notes = [f"{len(videos)} videos of {FRAMES} frames; the first is for testing, the others are seen at {FRAMES} moments in turn"]
-    return Scene(tuple(cameras), images, path, notes)
+    return Scene(tuple(cameras), images, path, notes, as_4dgaussians=True)
 
 
 def read_hypernerf(path: Path, cfg: dict[str, Any] | None = None) -> Scene:
@@ -99,7 +99,8 @@ def read_hypernerf(path: Path, cfg: dict[str, Any] | None = None) -> Scene:
             images[camera] = photograph
     if not cameras:
         raise SceneError(f"{path / 'dataset.json'}: lists no view; copy it again")
-    return Scene(tuple(cameras), images, path, [f"{len(cameras)} of {len(names)} views of a HyperNeRF capture, at 1/{shrunk} of its size"])
+    notes = [f"{len(cameras)} of {len(names)} views of a HyperNeRF capture, at 1/{shrunk} of its size"]
+    return Scene(tuple(cameras), images, path, notes, as_4dgaussians=not deformable)
 
 
 def _videos_of_deformable(path: Path, poses: Tensor, cfg: dict[str, Any]) -> Scene:

@@ -13,10 +13,12 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, type_of
+from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.base import Placed, SplatModel
 from mipmap_plugin.models.hosts import Capture
-from mipmap_plugin.scenes import Scene
+from mipmap_plugin.models.inria_folder import read_options
+from mipmap_plugin.scenes import DEFORMABLE, Scene, load_photographs
 from mipmap_plugin.scenes.base import SHAPE_TOLERANCE, SPLIT
 
 
@@ -88,8 +90,22 @@ def _difference(one: Camera, other: Camera) -> float:
     return sum(abs(math.log(ratio)) for ratio in ratios)
 
 
+def scene_of(model: SplatModel, images: Scene | str | Path) -> Scene:
+    """The scene, or that at a path, with the options of the model's training. Raises SceneError, and SettingsError for anything else."""
+    if isinstance(images, Scene):
+        return images
+    if not isinstance(images, (str, Path)):
+        raise SettingsError(f"images must be the path of the photographs' scene, or a Scene, got {type_of(images)}")
+    return load_photographs(path_of(images, "images"), read_options(model.folder)[0])
+
+
 def placed(model: SplatModel, scene: Scene) -> Scene:
-    """The scene in the frame that the model was trained in, and with its test views: gsplat and splatfacto transform it. Raises SceneError."""
+    """The scene in the frame that the model was trained in, and with its test views: gsplat and splatfacto transform it. Raises SceneError,
+    and SettingsError for a capture that was read as another project does."""
+    if scene.as_4dgaussians and DEFORMABLE in read_options(model.folder)[0]:
+        other = "was read as 4DGaussians does, and Deformable 3D Gaussians, which trained this checkpoint, takes other views and times"
+        remedy = "give the path itself as images or cameras, or read it by load_scene(path, {'is_6dof': False})"
+        raise SettingsError(f"{scene.source}: {other}; {remedy}")
     if not model.traits.placed:
         return scene
     scene = scene.original()
