@@ -170,8 +170,8 @@ def test_training_views_are_numbered_for_models_with_appearances(tmp_path, cfg, 
 def test_notes_say_what_was_assumed(tmp_path):
     write_text_model(tmp_path / "sparse/0", names(9))
     write_photographs(tmp_path / "images", ["000.png", "003.png"])
-    notes = " ".join(load_scene(tmp_path, {"eval": False}).notes)
-    assert "every 8th is for testing" in notes and "7 of 9 photographs" in notes and "not held out" in notes
+    notes = " ".join(load_scene(tmp_path).notes)
+    assert "every 8th is for testing" in notes and "7 of 9 photographs" in notes
 
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
