@@ -8,7 +8,7 @@ import tiny
 import torch
 from brief_runs import is_finite, shrunk
 
-from mipmap_plugin.adaptation.views import remarks, too_small
+from mipmap_plugin.adaptation.views import remarks
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
@@ -84,13 +84,14 @@ def test_a_scene_in_small_units_is_told_of_where_the_near_plane_keeps_an_orbit_a
         wrap_model(tiny.model(), cameras=[view.moved(far) for view in tiny.cameras(2)]).adapt(0.5, recipe="instant")
 
 
-@pytest.mark.parametrize(("count", "away"), [(1, 20.0), (5, 12.0)])
-def test_few_splats_may_be_small_since_they_are_as_large_as_pixels(count, away):
-    far = torch.diag(torch.tensor([away, away, away, 1.0], dtype=torch.float64))
+@pytest.mark.parametrize(("count", "spread"), [(1, 0.0), (5, 0.1)])
+def test_few_splats_may_be_small_as_they_are_as_large_as_pixels(count, spread):
+    far = torch.diag(torch.tensor([3.0, 3.0, 3.0, 1.0], dtype=torch.float64))
     views = [view.moved(far) for view in tiny.cameras(2, width=64, height=64)]
-    base = wrap_model(tiny.model(count, spread=0.2), cameras=views)
-    assert 2 < float(re.search(r"larger than (\S+) px", too_small(views, tiny.model(500, spread=0.2), 0.2, 16))[1]) < 16
-    assert len(base.adapt(0.5, steps=1, views="given").model) == count
+    few, many = tiny.model(count, spread=spread), tiny.model(300, spread=spread)
+    assert len(wrap_model(few, cameras=views).adapt(0.5, steps=1, views="given").model) == count
+    with pytest.raises(SettingsError, match=r"no view shows it larger than .* px: the cameras seem to be in other units"):
+        wrap_model(many, cameras=views).adapt(0.5, steps=1, views="given")
 
 
 @pytest.mark.parametrize("viewer", [None, "spark"])  # for which it is converted at x1 before
