@@ -68,7 +68,8 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         photograph, lens = folder / image.name, _lens(model.cameras[image.camera_id], unbent)
         exists, options = is_file(photograph), cfg
         if exists:
-            refuse_other_shape((camera.width, camera.height), size := image_size(photograph), str(photograph))
+            refuse_other_shape((camera.width, camera.height), photograph, str(photograph))
+            size = image_size(photograph)
         if exists and not is_copy:
             options = {**cfg, "images": "images", "ds": 1}
             camera, lens = camera.resized(*size), lens and lens.at(size)
