@@ -69,6 +69,8 @@ def _pixels(path: str | Path) -> np.ndarray:
     """A file's RGB or straight-alpha RGBA in 8 bits, [H, W, 3 or 4]; of 16 bits gray in 0..1, float32 [H, W, 3]. Raises SceneError."""
     with _opened(path) as image:
         _refuse_bomb(Path(path), *image.size)
+        if image.mode == "F":  # Pillow would take them for levels of 0 to 255
+            raise SceneError(f"{path}: its pixels are floats, which do not say what is white; save it with 8 or 16 bits")
         try:
             if image.mode in GRAY_16_BIT:
                 gray = np.asarray(image).astype(np.float32) / np.float32(65535)
