@@ -176,7 +176,7 @@ def not_held_out(model: Wrapped, scene: Scene) -> list[str]:
         return [f"{unmarked} {trained}, and the dB of every row, the base's included, are higher than on other views"] if seen else []
     if seen and options.get("eval") and options.get("train_test_exp"):
         return [f"cfg_args says --train_test_exp: the checkpoint was trained on half of each of {seen} of {len(judged)} photographed test views"]
-    if seen and options and not options.get("eval"):
+    if seen and options.get("eval") is False:
         trained = f"the checkpoint was trained on {seen} of {len(judged)} photographed test views"
         return [f"cfg_args says no --eval: {trained}, so that no row, the base's included, is held out from its training"]
     return []
