@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
+import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.target.resize import resize
@@ -88,10 +89,13 @@ def _difference(one: Camera, other: Camera) -> float:
     return sum(abs(math.log(ratio)) for ratio in ratios)
 
 
-def placed(model: SplatModel, scene: Scene) -> Scene:
-    """The scene in the frame that the model was trained in, and with its test views: gsplat and splatfacto transform it. Raises SceneError."""
+def placed(model: SplatModel, scene: Scene, cameras: Sequence[Camera] = ()) -> Scene:
+    """The scene in the frame that the model was trained in, and with its test views: gsplat and splatfacto transform it. Raises SceneError.
+
+    `cameras`: of the model, if any are known.
+    """
     if not model.traits.placed:
-        return scene
+        return _unapplied(scene, cameras)
     scene = scene.original()
     capture = Capture(scene.points, scene.smaller if scene.images else None, scene.applied_scale, scene.numbers)
     there = scene.with_cameras(cast(Placed, model).as_trained(scene.cameras, capture))
@@ -99,3 +103,18 @@ def placed(model: SplatModel, scene: Scene) -> Scene:
         return there
     tests = f"the checkpoint's options hold out {len(there.split('test'))} of {len(there.cameras)} views: these are for testing"
     return replace(there, notes=[*(note for note in there.notes if SPLIT not in note), tests])
+
+
+def _unapplied(scene: Scene, cameras: Sequence[Camera]) -> Scene:
+    """The scene in COLMAP's world if the base's `cameras` are there and not in that of nerfstudio's file, which was turned (`Scene.applied`)."""
+    original = scene.original()
+    if original is scene or not cameras or not _apart(original, cameras) < _apart(scene, cameras):
+        return scene
+    note = "its applied_transform is taken back, for the checkpoint's cameras are where these were before it"
+    return replace(original, notes=[*original.notes, note])
+
+
+def _apart(scene: Scene, cameras: Sequence[Camera]) -> float:
+    """How far from each other the nearest cameras of a scene and of a base are, median, in world units."""
+    there, here = (torch.stack([camera.center for camera in each]) for each in (scene.cameras, cameras))
+    return float(torch.cdist(there, here, compute_mode="donot_use_mm_for_euclid_dist").amin(1).median())
