@@ -35,10 +35,10 @@ class Photographs:
         if not self._originals:
             raise SettingsError(f"{scene.source}: there are no training images to adapt to; leave them out, or give the folder that has them")
         self.cameras = list(self._originals)
-        view, original = next(iter(self._originals.items()))
-        if (size := scene.image_size(original))[0] < (1 - SHAPE_TOLERANCE) * view.width:
-            small = f"{scene.images[original]} has {size[0]} x {size[1]} px, but the base was trained at {view.width} x {view.height} px"
-            raise SettingsError(f"{small}: made larger, it shows less than the base; give larger photographs, or leave them out")
+        for view, original in self._originals.items():
+            if (size := scene.image_size(original))[0] < (1 - SHAPE_TOLERANCE) * view.width:
+                small = f"{scene.images[original]} has {size[0]} x {size[1]} px, but the base was trained at {view.width} x {view.height} px"
+                raise SettingsError(f"{small}: made larger, it shows less than the base; give larger photographs, or leave them out")
 
     def note(self, views: Sequence[Camera]) -> str:
         """How many of the views have a photograph. Raises SettingsError if none has."""
