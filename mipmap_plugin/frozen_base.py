@@ -282,7 +282,7 @@ class FrozenBase:
 
     def place(self, scene: Scene) -> Scene:
         """Return the scene in the model's frame (`placed`); a checkpoint that came without cameras gets those of the scene."""
-        in_frame = placed(self.model, scene)
+        in_frame = placed(self.model, scene, self.cameras)
         if in_frame is not scene and not self.cameras:
             self.cameras = list(in_frame.cameras)
         return in_frame

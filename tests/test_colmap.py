@@ -117,6 +117,17 @@ def test_photographs_that_were_turned_are_refused(tmp_path):
         load_scene(tmp_path)
 
 
+@pytest.mark.parametrize(("orientation", "advice"), [(6, "its EXIF says to show it turned, .* turned "), (3, "it was turned or cropped")])
+def test_photographs_that_exif_would_turn_are_refused_with_what_to_do(tmp_path, orientation, advice):
+    write_text_model(tmp_path / "sparse/0", ["a.png"])
+    (tmp_path / "images").mkdir()
+    exif = Image.Exif()
+    exif[0x112] = orientation
+    Image.new("RGB", (48, 64)).save(tmp_path / "images/a.png", exif=exif)
+    with pytest.raises(SceneError, match=f"the photograph has 48 x 64 px: {advice}"):
+        load_scene(tmp_path)
+
+
 @pytest.mark.parametrize(("resolution", "size"), [(1, (48, 64)), (2, (24, 32)), (8, (6, 8)), (-1, (48, 64)), (20, (15, 20))])
 def test_the_training_size_follows_r_with_photographs_and_without(tmp_path, resolution, size):
     write_text_model(tmp_path / "sparse/0", names(2))
@@ -170,8 +181,8 @@ def test_training_views_are_numbered_for_models_with_appearances(tmp_path, cfg, 
 def test_notes_say_what_was_assumed(tmp_path):
     write_text_model(tmp_path / "sparse/0", names(9))
     write_photographs(tmp_path / "images", ["000.png", "003.png"])
-    notes = " ".join(load_scene(tmp_path, {"eval": False}).notes)
-    assert "every 8th is for testing" in notes and "7 of 9 photographs" in notes and "not held out" in notes
+    notes = " ".join(load_scene(tmp_path).notes)
+    assert "every 8th is for testing" in notes and "7 of 9 photographs" in notes
 
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])

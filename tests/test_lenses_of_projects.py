@@ -16,6 +16,7 @@ from mipmap_plugin.adaptation.target.photographs import placed
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.hosts import Capture, held_out
 from mipmap_plugin.scenes import Scene, load_scene, read_cameras, write_cameras
+from mipmap_plugin.wrap import wrap_model
 
 EYE = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
 
@@ -96,6 +97,19 @@ def test_a_scale_that_was_applied_before_is_not_applied_again(tmp_path):
     scene = transforms(tmp_path / "scene", width=64, height=48, applied_scale=0.1, frames=[frame])
     [camera] = placed(of_nerfstudio(tmp_path / "r", scale=0.5 * 0.1), scene).cameras
     torch.testing.assert_close(camera.center, torch.tensor([1.5, 0.0, 0.0], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("turned", [True, False])
+def test_photographs_of_nerfstudio_judge_a_base_of_colmaps_world(tmp_path, turned):
+    applied = torch.tensor([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]], dtype=torch.float64)
+    there = [view.moved(applied) for view in tiny.cameras(3)]
+    scene = Scene(tuple(there), {}, tmp_path, ["one"], applied=applied)
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(3) if turned else there)
+    found = base.place(scene)
+    for camera, own in zip(found.cameras, base.cameras, strict=True):
+        torch.testing.assert_close(camera.viewmat, own.viewmat)
+    assert [("applied_transform" in note) for note in found.notes] == [False, True][: 1 + turned]
+    assert wrap_model(tiny.model()).place(scene) is scene
 
 
 def test_gsplat_holds_out_the_views_that_its_options_say(tmp_path):

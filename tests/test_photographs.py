@@ -125,6 +125,9 @@ def test_images_of_which_none_is_adapted_to_are_refused(scene):
 def test_images_that_are_smaller_than_the_training_s_are_refused(scene):
     with pytest.raises(SettingsError, match=r"has 64 x 48 px, but the base was trained at 128 x 96 px: .* give larger photographs"):
         Photographs(scene, tiny.cameras(3, width=128, height=96), BLACK)
+    first, *others = tiny.cameras(3, width=128, height=96)  # of which each is the base's view of that name
+    with pytest.raises(SettingsError, match=r"view_1.png has 64 x 48 px, but the base was trained at 128 x 96 px"):
+        Photographs(scene, [first.resized(64, 48), *others], BLACK)
 
 
 def test_a_scene_without_training_images_is_refused(tmp_path):

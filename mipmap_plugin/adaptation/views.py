@@ -237,7 +237,10 @@ def too_near(views: Sequence[Camera], means: Tensor, near: float) -> str:
 
 
 def too_small(views: Sequence[Camera], model: SplatModel, near: float, least: float) -> str:
-    """That no view shows the scene `least` px large, in a sentence; "" if one does. `near`: the near plane, in world units."""
+    """That no view shows the scene `least` px large, in a sentence; "" if one does. `near`: the near plane, in world units.
+
+    A scene of no more splats than it has pixels is as small as it looks: in other units its splats would be smaller than pixels.
+    """
     splats = model.gaussians(views[0]).detach()
     if len(splats) == 0:
         return ""
@@ -251,6 +254,8 @@ def too_small(views: Sequence[Camera], model: SplatModel, near: float, least: fl
     wrong = "the cameras seem to be in other units; give those of this scene"
     if max(view.fx for view in views) * width / least < width / 2 + CLEAR * near:
         wrong = f"renderers of 3DGS draw nothing nearer than {near:g} units; {SCALE_UP}"
+    elif len(splats) <= most**2:
+        return ""
     return f"the scene is {units(width, 2)} units wide, and no view shows it larger than {units(most, 2)} px: {wrong}"
 
 

@@ -31,7 +31,7 @@ from mipmap_plugin.evaluation.metrics import psnr, ssim
 from mipmap_plugin.evaluation.other_scene import of_another_scene
 from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.photographs import digest_of_image
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, views_of_placed
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, not_held_out, views_of_placed
 from mipmap_plugin.evaluation.shots import Recorder, Shot, Watcher
 from mipmap_plugin.recipes import most_steps
 from mipmap_plugin.recipes import recipe as make_config
@@ -159,7 +159,8 @@ def evaluator_of(
 ) -> Evaluator:
     """What compares a model with the photographs of its scene; `cells`: where finished rows are kept. Raises SettingsError."""
     scene = model.place(scene)
-    return Evaluator(views_of_placed(model, scene), PROTOCOLS[protocol], perceptual, scene.source.name, cells=cells or Cells(), notes=scene.notes)
+    views, notes = views_of_placed(model, scene), [*scene.notes, *not_held_out(model, scene)]
+    return Evaluator(views, PROTOCOLS[protocol], perceptual, scene.source.name, cells=cells or Cells(), notes=notes)
 
 
 def evaluate(

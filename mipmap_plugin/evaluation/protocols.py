@@ -24,9 +24,11 @@ from mipmap_plugin.adaptation.target.photographs import at_density_of
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.evaluation.measure import views_seen
 from mipmap_plugin.evaluation.photographs import kept_photographs
 from mipmap_plugin.formats.images import averaged_straight, has_alpha, image_size, pillow_bicubic, read_image, read_straight
 from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.wrap import Wrapped
 
@@ -150,16 +152,50 @@ def views_of_placed(model: Wrapped, scene: Scene) -> list[TestView]:
 
 
 def test_views(scene: Scene, base: Sequence[Camera], background: tuple[float, float, float]) -> list[TestView]:
-    """The scene's test photographs (all, if none is marked as test), with their cameras at the pixel density of the cameras of the base.
+    """The scene's test photographs, with their cameras at the pixel density of the cameras of the base.
 
-    Raises SettingsError without photographs, SceneError for a damaged one.
+    If none is marked as test, those that the base holds out, by their poses, and else all (`not_held_out` says so). Raises SettingsError without
+    photographs, SceneError for a damaged one.
     """
-    cameras = [c for c in scene.cameras if c in scene.images]
-    cameras = [c for c in cameras if c.split == "test"] or cameras
+    cameras = _judged(scene, base)
     if not cameras:
         raise SettingsError(f"{scene.source}: there are no photographs to compare with")
     views = zip(at_density_of(cameras, base), kept_photographs(scene, cameras, background), (scene.images[c] for c in cameras), strict=True)
     return [TestView(camera, photograph, file, background, file in scene.lenses, has_alpha(file)) for camera, photograph, file in views]
+
+
+def not_held_out(model: Wrapped, scene: Scene) -> list[str]:
+    """A note, if a placed scene (`Wrapped.place`) marks no view as test, or the base was trained on those that are."""
+    views, judged, options = len(_photographed(scene)), _judged(scene, model.cameras), read_options(model.model.folder)[0]
+    seen = len(views_seen(judged, _split(model.cameras, "train")))
+    if not _split(judged, "test"):
+        unmarked = f"{scene.source.name}: no view is marked as for testing, so of {views} photographs"
+        if len(judged) < views:
+            return [f"{unmarked} those are taken that the checkpoint holds out: {len(judged)}"]
+        trained = f"all are taken: {seen} have poses that the checkpoint counts as its training's"
+        return [f"{unmarked} {trained}, and the dB of every row, the base's included, are higher than on other views"] if seen else []
+    if seen and options.get("eval") and options.get("train_test_exp"):
+        return [f"cfg_args says --train_test_exp: the checkpoint was trained on half of each of {seen} of {len(judged)} photographed test views"]
+    if seen and options.get("eval") is False:
+        trained = f"the checkpoint was trained on {seen} of {len(judged)} photographed test views"
+        return [f"cfg_args says no --eval: {trained}, so that no row, the base's included, is held out from its training"]
+    if seen and options.get("eval"):
+        return [f"{seen} of {len(judged)} photographed test views of {scene.source.name} are no test views of the checkpoint: it was trained on them"]
+    return []
+
+
+def _judged(scene: Scene, base: Sequence[Camera]) -> list[Camera]:
+    """The cameras of the photographs that are judged (`test_views`)."""
+    cameras = _photographed(scene)
+    return _split(cameras, "test") or views_seen(cameras, _split(base, "test")) or cameras
+
+
+def _photographed(scene: Scene) -> list[Camera]:
+    return [camera for camera in scene.cameras if camera in scene.images]
+
+
+def _split(cameras: Sequence[Camera], split: str) -> list[Camera]:
+    return [camera for camera in cameras if camera.split == split]
 
 
 def not_exposed(model: SplatModel) -> list[str]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import ExifTags, Image
 from torch import Tensor
 
 from mipmap_plugin.errors import SceneError, SettingsError, ShapeError, brief
@@ -18,6 +18,9 @@ from mipmap_plugin.limits import check_image
 
 # Pillow's modes for 16-bit gray. It reads 16-bit color as 8 bits, keeping the high byte.
 GRAY_16_BIT = ("I;16", "I;16B", "I;16L", "I;16N", "I")
+
+# EXIF orientations that exchange the sides of an image.
+QUARTER_TURNS = (5, 6, 7, 8)
 
 # Accepted formats; Pillow also supports formats whose images are programs (EPS).
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")
@@ -66,6 +69,8 @@ def _pixels(path: str | Path) -> np.ndarray:
     """A file's RGB or straight-alpha RGBA in 8 bits, [H, W, 3 or 4]; of 16 bits gray in 0..1, float32 [H, W, 3]. Raises SceneError."""
     with _opened(path) as image:
         _refuse_bomb(Path(path), *image.size)
+        if image.mode == "F":  # Pillow would take them for levels of 0 to 255
+            raise SceneError(f"{path}: its pixels are floats, which do not say what is white; save it with 8 or 16 bits")
         try:
             if image.mode in GRAY_16_BIT:
                 gray = np.asarray(image).astype(np.float32) / np.float32(65535)
@@ -130,6 +135,15 @@ def image_size(path: str | Path) -> tuple[int, int]:
     with _opened(path) as image:
         width, height = image.size
         return width, height
+
+
+def shown_turned(path: str | Path) -> bool:
+    """Whether an image file's EXIF says to show it with its sides exchanged. Raises SceneError."""
+    with _opened(path) as image:
+        try:
+            return image.getexif().get(ExifTags.Base.Orientation) in QUARTER_TURNS
+        except Exception:  # damaged EXIF fails in as many ways as there are, and says nothing
+            return False
 
 
 def write_image(path: str | Path, image: Tensor, *, overwrite: bool = False) -> Path:

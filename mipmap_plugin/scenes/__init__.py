@@ -73,7 +73,7 @@ def load_photographs(path: str | Path, cfg: dict[str, Any]) -> Scene:
     path = path_of(path)
     if DEFORMABLE in cfg and (is_dynerf(path) or is_hypernerf(path)):
         return load_scene(path, {**cfg, "resolution": 1})
-    return load_scene(path, {name: cfg[name] for name in (*UNBENT, "eval") if name in cfg} if unbent_by(cfg) and is_colmap(path) else None)
+    return load_scene(path, {name: cfg[name] for name in UNBENT if name in cfg} if unbent_by(cfg) and is_colmap(path) else None)
 
 
 def model_cameras(folder: str | Path | None, cfg: dict[str, Any] | None = None) -> list[Camera]:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mipmap_plugin.camera import DIGITS, Camera, digest_of
 from mipmap_plugin.errors import SceneError, SettingsError
-from mipmap_plugin.formats.images import image_size, is_file, read_image
+from mipmap_plugin.formats.images import image_size, is_file, read_image, shown_turned
 from mipmap_plugin.scenes.lenses import Lens
 
 # The word of notes on photographs that are not there.
@@ -143,12 +143,20 @@ def sizes_of(cameras: Sequence[Camera]) -> str:
     return f"{ends[0]} px" if len(sizes) == 1 else f"{' and ' if len(sizes) == 2 else ' to '}".join(ends) + " px"
 
 
-def refuse_other_shape(stated: tuple[int, int], photograph: tuple[int, int], where: str) -> None:
+def refuse_other_shape(stated: tuple[int, int], photograph: Path, where: str) -> None:
     """Raise SceneError, beginning with `where`, for a photograph that is no copy of the size that its camera states: one that was turned or cropped.
 
-    Both are (width, height), px. Resized to such a photograph, the camera would show a distorted scene.
+    `stated`: (width, height), px. Resized to such a photograph, the camera would show a distorted scene.
     """
-    (wide, high), (width, height) = stated, photograph
-    if abs(math.log(wide * height / (high * width))) > SHAPE_TOLERANCE + 1 / min(width, height):
+    (wide, high), (width, height) = stated, image_size(photograph)
+    if _other_shape(stated, (width, height)):
         advice = "it was turned or cropped since; give the photographs that the cameras were found in, or leave them out"
+        if shown_turned(photograph) and not _other_shape(stated, (height, width)):
+            advice = "its EXIF says to show it turned, which is not done here; save a copy whose pixels are turned (magick -auto-orient)"
         raise SceneError(f"{where}: its camera is of {wide} x {high} px, but the photograph has {width} x {height} px: {advice}")
+
+
+def _other_shape(stated: tuple[int, int], size: tuple[int, int]) -> bool:
+    """Whether the ratio of the sides of `size` is another than that of the `stated` one, beyond rounding."""
+    (wide, high), (width, height) = stated, size
+    return abs(math.log(wide * height / (high * width))) > SHAPE_TOLERANCE + 1 / min(width, height)

@@ -99,15 +99,18 @@ def _tests(names: list[str], path: Path, cfg: dict[str, Any]) -> set[int]:
 def count_test_cameras(names: list[str]) -> int:
     """The number of test cameras; INRIA lists them first but does not state their number.
 
-    A Blender scene uses the same names for test and training views (r_0, r_1, ...), so the first repeated name
-    starts the training views. In a COLMAP scene names are unique, and one view in eight is for testing.
+    In a COLMAP scene one view in eight is for testing, in the order of names. These may repeat, for INRIA cut them off at the first dot and left out
+    folders until October 2024. A Blender scene uses the same names for test and training views (r_0, r_1, ...), so the first repeated name starts
+    the training views.
     """
-    seen: set[str] = set()
+    first, ordered, seen = math.ceil(len(names) / TEST_EVERY), sorted(names), set[str]()
+    if names[:first] == ordered[::TEST_EVERY] and names[first:] == [name for place, name in enumerate(ordered) if place % TEST_EVERY]:
+        return first
     for index, name in enumerate(names):
         if name in seen:
             return index
         seen.add(name)
-    return math.ceil(len(names) / TEST_EVERY)
+    return first
 
 
 def numbers_views(cfg: dict[str, Any], split: str) -> bool:

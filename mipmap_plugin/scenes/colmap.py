@@ -68,7 +68,8 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         photograph, lens = folder / image.name, _lens(model.cameras[image.camera_id], unbent)
         exists, options = is_file(photograph), cfg
         if exists:
-            refuse_other_shape((camera.width, camera.height), size := image_size(photograph), str(photograph))
+            refuse_other_shape((camera.width, camera.height), photograph, str(photograph))
+            size = image_size(photograph)
         if exists and not is_copy:
             options = {**cfg, "images": "images", "ds": 1}
             camera, lens = camera.resized(*size), lens and lens.at(size)
@@ -81,7 +82,7 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         cameras.append(camera)
         if exists:
             photographs[camera] = photograph
-    notes = _notes(cameras, photographs, folder, cfg) + ([note(lenses.values())] if lenses else [])
+    notes = _notes(cameras, photographs, folder) + ([note(lenses.values())] if lenses else [])
     if is_copy:
         notes.append(f"there is no folder {photographs_folder(cfg)}: the photographs are those of {folder.name}")
     if models := sorted({lens.model for camera in model.cameras.values() if (lens := _lens(camera)) and lens.model in unbent}):
@@ -175,10 +176,8 @@ def _points(model: pycolmap.Reconstruction) -> Tensor | None:
     return torch.stack(places) if places else None
 
 
-def _notes(cameras: list[Camera], photographs: dict[Camera, Path], folder: Path, cfg: dict[str, Any]) -> list[str]:
+def _notes(cameras: list[Camera], photographs: dict[Camera, Path], folder: Path) -> list[str]:
     notes = [f"{len(cameras)} cameras in the order of their names: every {TEST_EVERY}th {SPLIT}, the others for training"]
     if absent := len(cameras) - len(photographs):
         notes.append(f"{absent} of {len(cameras)} photographs of the COLMAP model are {ABSENT} from {folder}; their cameras are views without one")
-    if cfg and not cfg.get("eval"):
-        notes.append("the checkpoint was trained without --eval, on the test views too, so that they are not held out")
     return notes

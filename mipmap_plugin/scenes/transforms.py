@@ -143,8 +143,8 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
         if actual:
             name = image.stem if image else _stem(listed.replace("\\", "/").rsplit("/", 1)[-1])
             split = split if trained is None else "train" if _place(listed) in trained else "test"
-            if stated:
-                refuse_other_shape(stated, actual, f"{where} ({name})")
+            if stated and image:
+                refuse_other_shape(stated, image, f"{where} ({name})")
             model = _lens_model(values, f"{where} ({name})")
             camera = _camera(values, stated or actual, name, split, f"{where} ({name})").resized(*actual)
             lens = _lens(values, model, camera, f"{where} ({name})")

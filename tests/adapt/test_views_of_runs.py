@@ -84,6 +84,16 @@ def test_a_scene_in_small_units_is_told_of_where_the_near_plane_keeps_an_orbit_a
         wrap_model(tiny.model(), cameras=[view.moved(far) for view in tiny.cameras(2)]).adapt(0.5, recipe="instant")
 
 
+@pytest.mark.parametrize(("count", "spread"), [(1, 0.0), (5, 0.1)])
+def test_few_splats_may_be_small_as_they_are_as_large_as_pixels(count, spread):
+    far = torch.diag(torch.tensor([3.0, 3.0, 3.0, 1.0], dtype=torch.float64))
+    views = [view.moved(far) for view in tiny.cameras(2, width=64, height=64)]
+    few, many = tiny.model(count, spread=spread), tiny.model(300, spread=spread)
+    assert len(wrap_model(few, cameras=views).adapt(0.5, steps=1, views="given").model) == count
+    with pytest.raises(SettingsError, match=r"no view shows it larger than .* px: the cameras seem to be in other units"):
+        wrap_model(many, cameras=views).adapt(0.5, steps=1, views="given")
+
+
 @pytest.mark.parametrize("viewer", [None, "spark"])  # for which it is converted at x1 before
 def test_a_small_scene_may_be_zoomed_into(viewer):
     far = torch.diag(torch.tensor([12.0, 12.0, 12.0, 1.0], dtype=torch.float64))

@@ -25,10 +25,10 @@ def test_evaluate_prints_a_table_and_writes_its_rows(run, model_folder, tmp_path
     code, out, _ = run(*words)
     assert code == 0
     assert "truth: P1" in out and "real dB over 2 views\n" in out and "| x1 " in out and "| x0.25 " in out and "base, resized" in out
-    assert "instant, 1 of 2 judged views adapted to" in out  # the folder has no cfg_args, and one of its cameras is judged
+    assert "instant, 1 of 2 judged views adapted to" in out  # of the folder's cameras, one is judged
     written = json.loads((tmp_path / "rows.json").read_text())
     rows = written["rows"]
-    assert written["notes"] == [] and written["judged_views"] == [2]
+    assert written["judged_views"] == [2] and [note[:23] for note in written["notes"]] == ["cfg_args says no --eval"]
     assert [row["name"] for row in rows][:2] == ["base", "base"] and rows[0]["psnr_db"] > 50
     refused(run(*words), "rows.json exists already; pass --overwrite")
 
@@ -42,7 +42,7 @@ def test_evaluate_says_where_a_file_is_adapted_to_images_of_another_filter_than_
         code, out, err = run(*words, *options, "--no-report", "--json")
         assert code == 0, err
         notes.append(json.loads(out)["notes"])
-    assert [len(each) for each in notes] == [1, 0, 0] and notes[0][0].startswith(told)
+    assert [len(each) for each in notes] == [2, 1, 1] and notes[0][1].startswith(told)
 
 
 def test_evaluate_as_json(run, model_folder, tmp_path):
@@ -60,7 +60,7 @@ def test_evaluate_says_which_rows_are_missing_and_that_no_row_is_exposed(run, mo
     code, out, _ = run(*words, "--scale", "1/2")
     assert code == 0 and re.fullmatch(missing, out.splitlines()[-3]) and out.splitlines()[-2] == exposed and "| window" not in out
     code, out, _ = run(*words, "--scale", "1", "--json")
-    assert code == 0 and json.loads(out)["notes"] == [exposed]
+    assert code == 0 and json.loads(out)["notes"][1:] == [exposed]
 
 
 def test_evaluate_and_tradeoff_tell_of_photographs_that_are_absent(run, model_folder, tmp_path):
@@ -70,11 +70,39 @@ def test_evaluate_and_tradeoff_tell_of_photographs_that_are_absent(run, model_fo
     words = [model_folder, "--images", scene, "--scale", "1/2", "--recipe", "instant", "--json"]
     code, out, err = run("evaluate", *words, "--output", tmp_path / "rows.json")
     assert code == 0 and f"mipmap-plugin: {scene}: {note}\n" in err
-    assert json.loads(out)["judged_views"] == [1] and json.loads(out)["notes"] == [note]
+    assert json.loads(out)["judged_views"] == [1] and json.loads(out)["notes"][0] == note
     page = (tmp_path / "rows.html").read_text()
     assert note in page and "photographs, protocol P1, 1 view" not in page and "photographs, protocol P3, 1 view" in page
     code, out, err = run("tradeoff", *words, "--output", tmp_path / "out", "--no-picture", "--no-renderers", "--repeats", "1")
-    assert code == 0 and f"mipmap-plugin: {scene}: {note}\n" in err and json.loads(out)["scales"][0]["notes"] == [note]
+    assert code == 0 and f"mipmap-plugin: {scene}: {note}\n" in err and json.loads(out)["scales"][0]["notes"][0] == note
+
+
+def test_evaluate_says_that_the_base_was_trained_on_what_is_judged(run, model_folder, tmp_path):
+    """Of photographs without a split those are judged that the checkpoint holds out, and else all."""
+    train, test = tiny.cameras(3), tiny.cameras(1, seed=9, split="test")
+    unmarked = tiny.scene(tmp_path / "scene", train=[*train, replace(test[0], name="other")])
+    marked = tiny.scene(tmp_path / "marked", test=[*test, replace(train[1], split="test")])
+    (unmarked / "transforms_test.json").unlink()
+    (unmarked / "transforms_train.json").rename(unmarked / "transforms.json")
+    no_split = "scene: no view is marked as for testing, so of 4 photographs those are taken that the checkpoint holds out: 1"
+    all_of_them = "scene: no view is marked as for testing, so of 4 photographs all are taken: 4 have poses that the checkpoint counts as"
+    both = "cfg_args says no --eval: the checkpoint was trained on 2 of 2 photographed test views, so that no row, the base's included, is held out"
+    halves = "cfg_args says --train_test_exp: the checkpoint was trained on half of each of 1 of 2 photographed test views"
+    for options, scene, judged, note in [
+        ("Namespace(eval=True)", unmarked, 1, no_split),
+        ("Namespace(eval=False)", unmarked, 4, all_of_them),
+        (None, unmarked, 4, all_of_them),
+        ("Namespace(eval=False)", marked, 2, both),
+        ("Namespace(eval=True, train_test_exp=True)", marked, 2, halves),
+        ("Namespace(eval=True)", marked, 2, "1 of 2 photographed test views of marked are no test views of the checkpoint: it was trained on them"),
+        (None, marked, 2, None),
+    ]:
+        (model_folder / "cfg_args").write_text(options) if options else (model_folder / "cfg_args").unlink()
+        code, out, err = run("evaluate", model_folder, "--images", scene, "--scale", "1", "--no-report", "--json")
+        assert code == 0, err
+        told = json.loads(out)
+        assert told["judged_views"] == [judged] and len(told["notes"]) == (note is not None)
+        assert note is None or told["notes"][0].startswith(note)
 
 
 def test_evaluate_averages_several_scenes_and_prints_the_published_rows(run, model_folder, tmp_path):

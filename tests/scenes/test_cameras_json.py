@@ -72,6 +72,25 @@ def test_leading_cameras_are_for_testing(names, count):
     assert count_test_cameras(names) == count
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["frame"] * 100,  # frame.0001.jpg, frame.0002.jpg, ...
+        sorted(f"{frame:04d}" for frame in range(40) for _ in range(10)),  # of a rig, in a folder for each of its ten cameras
+        sorted([f"IMG_{number}" for number in range(1000, 1080)] + [f"IMG_{number}" for number in range(1050, 1160)]),  # of two phones
+    ],
+)
+def test_names_that_repeat_because_they_are_cut_say_which_cameras_are_for_testing(names):
+    """INRIA cut names of photographs off at their first dot, and left out their folders, until October 2024."""
+    tests = names[::8]
+    assert count_test_cameras([*tests, *(name for place, name in enumerate(names) if place % 8)]) == len(tests)
+
+
+def test_blender_cameras_of_several_folders_are_for_testing_up_to_the_first_repeated_name():
+    moments = [f"{moment:04d}" for moment in range(30)]
+    assert count_test_cameras(moments * 5) == 30
+
+
 def test_without_eval_every_camera_is_for_training(tmp_path):
     path = write_json(tmp_path / "cameras.json", [entry(img_name=name) for name in "abab"])
     assert [camera.split for camera in read_cameras(path, {"eval": False})] == ["train"] * 4

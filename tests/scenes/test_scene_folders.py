@@ -162,6 +162,12 @@ def test_16_bit_gray_keeps_its_precision(tmp_path):
     torch.testing.assert_close(image[..., 1], torch.from_numpy(values.astype(np.float32)) / 65535)
 
 
+def test_an_image_of_floats_is_refused_instead_of_black(tmp_path):
+    Image.fromarray(np.float32([[0.2, 0.9]])).save(tmp_path / "a.tif")
+    with pytest.raises(SceneError, match=r"a.tif: its pixels are floats, .*; save it with 8 or 16 bits"):
+        read_image(tmp_path / "a.tif", (0, 0, 0))
+
+
 def test_the_size_is_read_from_the_header_alone(tmp_path):
     path = save_image(tmp_path / "a.png", 800, 600)
     path.write_bytes(path.read_bytes()[:50])  # the pixels start at byte 41

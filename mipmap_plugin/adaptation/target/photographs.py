@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
+import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.target.resize import resize
@@ -36,10 +37,10 @@ class Photographs:
         if not self._originals:
             raise SettingsError(f"{scene.source}: there are no training images to adapt to; leave them out, or give the folder that has them")
         self.cameras = list(self._originals)
-        view, original = next(iter(self._originals.items()))
-        if (size := scene.image_size(original))[0] < (1 - SHAPE_TOLERANCE) * view.width:
-            small = f"{scene.images[original]} has {size[0]} x {size[1]} px, but the base was trained at {view.width} x {view.height} px"
-            raise SettingsError(f"{small}: made larger, it shows less than the base; give larger photographs, or leave them out")
+        for view, original in self._originals.items():
+            if (size := scene.image_size(original))[0] < (1 - SHAPE_TOLERANCE) * view.width:
+                small = f"{scene.images[original]} has {size[0]} x {size[1]} px, but the base was trained at {view.width} x {view.height} px"
+                raise SettingsError(f"{small}: made larger, it shows less than the base; give larger photographs, or leave them out")
 
     def note(self, views: Sequence[Camera]) -> str:
         """How many of the views have a photograph. Raises SettingsError if none has."""
@@ -99,15 +100,17 @@ def scene_of(model: SplatModel, images: Scene | str | Path) -> Scene:
     return load_photographs(path_of(images, "images"), read_options(model.folder)[0])
 
 
-def placed(model: SplatModel, scene: Scene) -> Scene:
-    """The scene in the frame that the model was trained in, and with its test views: gsplat and splatfacto transform it. Raises SceneError,
-    and SettingsError for a capture that was read as another project does."""
+def placed(model: SplatModel, scene: Scene, cameras: Sequence[Camera] = ()) -> Scene:
+    """The scene in the frame that the model was trained in, and with its test views: gsplat and splatfacto transform it.
+
+    `cameras`: of the model, if any are known. Raises SceneError, and SettingsError for a capture that was read as another project does.
+    """
     if scene.as_4dgaussians and DEFORMABLE in read_options(model.folder)[0]:
         other = "was read as 4DGaussians does, and Deformable 3D Gaussians, which trained this checkpoint, takes other views and times"
         remedy = "give the path itself as images or cameras, or read it by load_scene(path, {'is_6dof': False})"
         raise SettingsError(f"{scene.source}: {other}; {remedy}")
     if not model.traits.placed:
-        return scene
+        return _unapplied(scene, cameras)
     scene = scene.original()
     capture = Capture(scene.points, scene.smaller if scene.images else None, scene.applied_scale, scene.numbers)
     there = scene.with_cameras(cast(Placed, model).as_trained(scene.cameras, capture))
@@ -115,3 +118,18 @@ def placed(model: SplatModel, scene: Scene) -> Scene:
         return there
     tests = f"the checkpoint's options hold out {len(there.split('test'))} of {len(there.cameras)} views: these are for testing"
     return replace(there, notes=[*(note for note in there.notes if SPLIT not in note), tests])
+
+
+def _unapplied(scene: Scene, cameras: Sequence[Camera]) -> Scene:
+    """The scene in COLMAP's world if the base's `cameras` are there and not in that of nerfstudio's file, which was turned (`Scene.applied`)."""
+    original = scene.original()
+    if original is scene or not cameras or not _apart(original, cameras) < _apart(scene, cameras):
+        return scene
+    note = "its applied_transform is taken back, for the checkpoint's cameras are where these were before it"
+    return replace(original, notes=[*original.notes, note])
+
+
+def _apart(scene: Scene, cameras: Sequence[Camera]) -> float:
+    """How far from each other the nearest cameras of a scene and of a base are, median, in world units."""
+    there, here = (torch.stack([camera.center for camera in each]) for each in (scene.cameras, cameras))
+    return float(torch.cdist(there, here, compute_mode="donot_use_mm_for_euclid_dist").amin(1).median())

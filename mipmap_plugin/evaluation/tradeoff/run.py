@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.cells import Cells
-from mipmap_plugin.evaluation.protocols import not_exposed
+from mipmap_plugin.evaluation.protocols import not_exposed, not_held_out
 from mipmap_plugin.evaluation.tradeoff.files import KEPT, Folder, goes_on, write
 from mipmap_plugin.evaluation.tradeoff.front import Tradeoff
 from mipmap_plugin.evaluation.tradeoff.measuring import left_out, measure
@@ -29,7 +29,8 @@ def run(model: Wrapped, scene: Scene | None, scales: Sequence[float], plan: Plan
     truths = [base_itself(model, scale, views) if scene is None else photographs(model, scene, scale, views) for scale in scales]
     made_from = {"base": model.model.digest, "asked": model.asked, "trained": str(model.trained), "scene": scene and scene.digest()}
     cells = Cells(folder.path / KEPT, made_from | {"views": views, "threads": model.threads})
-    notes = left_out(model, plan) + ([*model.place(scene).notes, *not_exposed(model.model)] if scene else [])
+    there = model.place(scene) if scene else None
+    notes = left_out(model, plan) + ([*there.notes, *not_held_out(model, there), *not_exposed(model.model)] if there else [])
     tradeoffs = [Tradeoff(scale, truth.label, [], notes) for scale, truth in zip(scales, truths, strict=True)]
     try:
         for tradeoff, truth in zip(tradeoffs, truths, strict=True):
