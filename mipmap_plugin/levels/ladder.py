@@ -1,7 +1,8 @@
 """A ladder of levels: x1, and coarser and coarser files of the same scene, each adapted to the zooms that a viewer shows it at.
 
-Every level is made from the one before, whose splats are merged; its truth is always the base. In the viewer that it is made for, a level
-looks right over its band, and neighbors are equally good where a viewer should change from one to the other.
+Every level is made from the one before, whose splats are merged; without steps, which would regain what that costs, from the base. Its truth is
+always the base. In the viewer that it is made for, a level looks right over its band, and neighbors are equally good where a viewer should change
+from one to the other.
 """
 
 from __future__ import annotations
@@ -94,13 +95,11 @@ class _Work:
         return levels, left_out, band.low
 
     def _next(self, finer: Level, above: Band, number: int, ratio: float) -> tuple[Level, float]:
-        """The level for the band below `above`, made from the finer one, and its ratio; one that is not good enough is made again for a narrower
-        band."""
+        """The level for the band below `above` and the finer one, and its ratio; one that is not good enough is made again for a narrower band."""
         start, ratio = FinerLevel(finer.adapted.model, finer.band.scale), self.request.next_ratio(above.low, ratio)
         while True:
             band = above.next(ratio, self.request.coarsest)
-            settings = band.settings() | {"start": start, **self.request.steps(band.scale)}
-            level = self._made(f"level_{number}_x{band.scale:.6g}", band, settings)
+            level = self._made(f"level_{number}_x{band.scale:.6g}", band, self.request.below(start, band))
             narrower = ratio**0.5
             if self._suffices(level) or narrower * SAME < FINEST_RATIO:
                 return level, ratio

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import check_scale
@@ -99,6 +100,13 @@ class LadderRequest:
         """The ratio below a level that is shown down to this zoom, after levels of the given ratio."""
         return min(ratio, NARROW) if self.ratio is None and shown_down_to < DENSE_BELOW else ratio
 
+    def below(self, finer: FinerLevel, band: Band) -> dict[str, Any]:
+        """How a level of a band is made below a finer one: from it, merged further than is good before steps. Where no step regains that, from
+        the base, merged as the recipe allows, so that losses of one level are not those of the next."""
+        settings = band.settings() | self.steps(band.scale)
+        learns = recipe(self.recipe, band.scale, **self.settings).steps > 0
+        return settings | ({"start": finer, "merging_costs": MERGING_COSTS} if learns else {})
+
     def steps(self, scale: float) -> dict[str, Any]:
         """The settings of AdaptConfig for the steps of a level that starts from a finer one; fewer of a large scene, unless the user settles it.
 
@@ -143,5 +151,5 @@ class Band:
     def settings(self) -> dict[str, Any]:
         """The settings of AdaptConfig for this band."""
         kept = KEPT * (self.ratio**POWER - 1) * self.scale**POWER  # a geometric series, whose sum is KEPT
-        merging = {"merge_to": min(1.0, kept), "merging_costs": MERGING_COSTS} if self.scale < 1 else {}
+        merging = {"merge_to": min(1.0, kept)} if self.scale < 1 else {}
         return {"band": (self.low / self.scale, self.high / self.scale), "resize": "pil-bicubic", **merging}

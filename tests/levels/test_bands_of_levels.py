@@ -20,7 +20,7 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.levels.ladder import make_levels
-from mipmap_plugin.levels.request import FINEST_RATIO, NARROW, STEPS_KEPT, WIDE, Band, LadderRequest
+from mipmap_plugin.levels.request import FINEST_RATIO, MERGING_COSTS, NARROW, STEPS_KEPT, WIDE, Band, LadderRequest
 from mipmap_plugin.recipes import recipe
 
 pytestmark = pytest.mark.usefixtures("brief_ladders", "few_views")
@@ -106,6 +106,17 @@ def test_levels_below_a_half_are_denser_unless_a_ratio_is_asked_for():
 def test_a_level_that_starts_from_a_finer_one_takes_fewer_steps():
     assert LadderRequest("spark").steps(1 / 4)["steps"] == math.ceil(STEPS_KEPT * recipe("default", 1 / 4).steps)
     assert LadderRequest("spark", recipe="instant").steps(1 / 4)["steps"] == 0
+
+
+@pytest.mark.parametrize(("name", "settings", "costs"), [("instant", {}, 0.3), ("default", {"steps": 0}, 0.3), ("default", BRIEF, MERGING_COSTS)])
+def test_a_level_without_steps_is_merged_from_the_base_as_the_recipe_allows(monkeypatch, name, settings, costs):
+    """No step regains what merging costs, which would add up from level to level."""
+    base, starts = wrapped(), []
+    adapt = base.adapt
+    monkeypatch.setattr(base, "adapt", lambda scale, **given: starts.append(given.get("start")) or adapt(scale, **given))
+    levels = make_levels(base, LadderRequest("antialiased", 1 / 4, 2.0, recipe=name, settings=settings)).levels[1:]
+    assert [level.adapted.report.settings.merging_costs for level in levels] == [costs] * len(levels) and len(starts) == 3
+    assert [start is None for start in starts[1:]] == [costs < MERGING_COSTS] * 2
 
 
 def test_levels_of_a_large_scene_take_fewer_steps_unless_asked_for(monkeypatch):
