@@ -1,5 +1,6 @@
-"""Every built-in family passes the suite for third-party families."""
+"""Every built-in family passes the suite for third-party families, and a broken one does not."""
 
+from dataclasses import replace
 from functools import partial
 
 import anchor_checkpoints
@@ -11,8 +12,11 @@ import test_surfels
 import tiny
 import torch_checkpoints
 
+from mipmap_plugin import wrap_model
+from mipmap_plugin.models import Traits
 from mipmap_plugin.models.conformance import ModelSuite
 from mipmap_plugin.models.families import BUILT_IN
+from mipmap_plugin.models.vanilla import VanillaModel
 
 WRITERS = {
     "3dgs": partial(tiny.folder, views=tiny.cameras()),
@@ -52,3 +56,26 @@ for family in WRITERS:
 
 def test_every_family_that_is_loaded_is_in_the_suite():
     assert {family.name for family in BUILT_IN if family.load} - ELSEWHERE == set(WRITERS)
+
+
+class Drifting(VanillaModel):
+    """Its splats move, but those of a copy do not."""
+
+    velocity = 0.0
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.traits = Traits(moves=True)
+
+    def gaussians(self, camera=None):
+        splats, time = super().gaussians(camera), camera.time if camera else None
+        return replace(splats, means=splats.means + self.velocity * (time or 0))
+
+
+@pytest.mark.parametrize("check", [ModelSuite.test_shapes_that_stay_keep_the_picture, ModelSuite.test_goes_to_another_device])
+def test_the_suite_looks_at_later_moments_of_what_moves(check):
+    still, drifting = (wrap_model(Drifting(tiny.model(40).parameters()), cameras=tiny.cameras(), backend="reference") for _ in range(2))
+    drifting.model.velocity = 0.5
+    check(ModelSuite(), still)
+    with pytest.raises(AssertionError, match="a picture changes by up to"):
+        check(ModelSuite(), drifting)
