@@ -179,7 +179,7 @@ def not_held_out(model: Wrapped, scene: Scene) -> list[str]:
     if seen and options.get("eval") is False:
         trained = f"the checkpoint was trained on {seen} of {len(judged)} photographed test views"
         return [f"cfg_args says no --eval: {trained}, so that no row, the base's included, is held out from its training"]
-    if seen and options.get("eval"):
+    if seen and options.get("eval") and not options.get("lod"):  # whose test views are others
         return [f"{seen} of {len(judged)} photographed test views of {scene.source.name} are no test views of the checkpoint: it was trained on them"]
     return []
 

@@ -22,6 +22,9 @@ from mipmap_plugin.scenes.lenses import INSTALL, Lens, can_undistort, note
 
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
+# Focal lengths: along x, by which a frame has a lens of its own, and along y.
+FOCAL = ("fl_x", "camera_angle_x", "fl_y", "camera_angle_y")
+
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
@@ -134,7 +137,8 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
         where = f"{file}, frame {index}"
         if not isinstance(frame, dict):
             raise SceneError(f"{where}: is not a camera; export the file again")
-        values = {**data, **frame}  # a frame's own intrinsics override the file's
+        others = [key for key in FOCAL if FOCAL[0] in frame or FOCAL[1] in frame]  # of the file, which are of another lens
+        values = {**{key: value for key, value in data.items() if key not in others}, **frame}  # a frame's own intrinsics override the file's
         listed = str(present(frame, "file_path", where))
         image = _image(file.parent, listed)
         absent += image is None

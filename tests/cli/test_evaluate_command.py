@@ -95,6 +95,7 @@ def test_evaluate_says_that_the_base_was_trained_on_what_is_judged(run, model_fo
         ("Namespace(eval=False)", marked, 2, both),
         ("Namespace(eval=True, train_test_exp=True)", marked, 2, halves),
         ("Namespace(eval=True)", marked, 2, "1 of 2 photographed test views of marked are no test views of the checkpoint: it was trained on them"),
+        ("Namespace(eval=True, lod=30)", marked, 2, None),  # Scaffold-GS's option, by which other views are for testing
         (None, marked, 2, None),
     ]:
         (model_folder / "cfg_args").write_text(options) if options else (model_folder / "cfg_args").unlink()

@@ -96,6 +96,17 @@ def test_a_stated_lens_follows_the_size_of_the_image(tmp_path):
     assert (camera.size, camera.fx, camera.fy, camera.cx, camera.cy) == ((6, 8), 25.0, 22.5, 4.25, 2.75)
 
 
+@pytest.mark.parametrize(
+    ("own", "focal"),
+    [({"fl_x": 20}, (20, 20)), ({"camera_angle_x": math.pi / 2}, (4, 4)), ({"fl_x": 20, "fl_y": 21}, (20, 21)), ({"fl_y": 21}, (9, 21))],
+)
+def test_a_frames_own_focal_length_is_not_mixed_with_the_files(tmp_path, own, focal):
+    save_image(tmp_path / "train/r_0.png")
+    write_json(tmp_path / "transforms.json", {"fl_x": 9, "fl_y": 10, "camera_angle_x": 1.0, "frames": [frame(**own)]})
+    [camera] = load_scene(tmp_path).cameras
+    assert (camera.fx, camera.fy) == pytest.approx(focal)
+
+
 def test_a_frames_own_lens_wins(tmp_path):
     data = {"fl_x": 100.0, "w": 32, "h": 24, "frames": [frame(), frame(fl_x=50.0, time=0.25)]}
     first, second = read_transforms(write_json(tmp_path / "transforms.json", data)).cameras
