@@ -5,8 +5,11 @@ from __future__ import annotations
 import importlib.util
 import math
 import os
+import subprocess
+import sys
 import time
 from dataclasses import fields, replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -161,6 +164,29 @@ def test_the_number_of_threads_changes_no_bit(screen_filter, threads_for_any_wor
     for image, alpha, grads in results[1:]:
         assert torch.equal(image, results[0][0]) and torch.equal(alpha, results[0][1])
         assert all(torch.equal(grad, results[0][2][name]) for name, grad in grads.items())
+
+
+IN_PARTS = """
+import hashlib, sys, torch
+from mipmap_plugin.backends.cpu_kernels import lanes
+torch.set_num_threads(1)
+lanes.PART = int(sys.argv[1])
+from test_cpu_backend import WIDE, Effects, draw, gaussians
+image, alpha, grads = draw(gaussians(1003, 3), WIDE, Effects(3))
+print(*(hashlib.sha256(part.numpy().tobytes()).hexdigest() for part in (image, alpha, *grads.values())))
+"""
+
+
+@needs_numba
+@pytest.mark.slow
+def test_how_many_numbers_a_register_holds_changes_no_bit(tmp_path):
+    """Processors with AVX-512 compute the geometry of 8 splats at a time, others that of 4; either can be compiled anywhere."""
+    printed = []
+    for part in ("4", "8"):
+        environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / part)}
+        command = [sys.executable, "-c", IN_PARTS, part]
+        printed.append(subprocess.run(command, capture_output=True, text=True, env=environment, cwd=Path(__file__).parent, check=True).stdout)
+    assert printed[0] == printed[1] and len(printed[0].split()) == 7
 
 
 SHOTS = [

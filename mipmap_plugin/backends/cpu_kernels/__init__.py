@@ -7,8 +7,8 @@ Memory layout. All arrays are contiguous; a pair is a splat and a tile that it t
         splat 0   | X | Y | SHEAR | FALL_Y | PEAK | PER_FALL_X | ... | RED | GREEN | BLUE | GAIN | OFFSET | GATE | unused |
         splat 1   | ...
 
-    block (`blocks`), on the stack: the fields of 16 splats, so that one field is one set of lanes (`lanes`). Geometry, in float64, takes a
-    part of these splats at a time, whose pointer is `beyond` the block's by so many splats.
+    block (`blocks`), on the stack: the fields of 16 splats, so that one field is one set of lanes (`lanes`). Geometry is in
+    float64, of which a register holds fewer: it is computed part by part of the 16.
 
         | X of 16 splats | Y of 16 splats | SHEAR of 16 splats | ...
 

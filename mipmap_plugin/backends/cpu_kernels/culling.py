@@ -1,4 +1,4 @@
-"""Culling, stretching and limiting of 16 splats on the image, and the gradients (formulas: `splatting.culls`).
+"""Culling, stretching and limiting of splats on the image, and the gradients (formulas: `splatting.culls`).
 
 All numbers are lanes of float64. Shapes are (xx, xy, yy, det) as in `ellipses`, after dilation.
 """

@@ -1,4 +1,4 @@
-"""The ellipses of 16 splats on the image from their shapes in the world, and the gradients (EWA projection, as in 3DGS).
+"""The ellipses of splats on the image from their shapes in the world, and the gradients (EWA projection, as in 3DGS).
 
 All numbers are lanes of float64.
 

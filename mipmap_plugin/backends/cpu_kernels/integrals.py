@@ -34,7 +34,7 @@ MARGIN = 1.01
 def axes(shape):
     """The direction (cos, sin) of a shape's longer axis, and the standard deviations along it and across, px.
 
-    In this module, shapes are lanes of float64 for 16 splats; pixels are lanes of float32.
+    In this module, shapes are lanes of float64, one for each splat; pixels are lanes of float32.
     """
     mean, half, spread = polar(shape)
     is_round = spread <= 0
@@ -106,7 +106,7 @@ def mass(splat_axes, opacity):
 
 @inner
 def put_integral(splat_axes, mass, block):
-    """Write the fields of 16 splats that `alpha` needs."""
+    """Write the splats' fields that `alpha` needs."""
     cos, sin, long, short = splat_axes
     put(block, layout.COS, narrow(cos))
     put(block, layout.SIN, narrow(sin))

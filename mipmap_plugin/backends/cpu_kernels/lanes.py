@@ -21,7 +21,8 @@ from numba.extending import intrinsic, lower_builtin, models, register_model, ty
 
 WIDTH = 16
 
-# Splats whose geometry is computed at a time: as many float64 as a register holds. Of more the numbers do not fit into all registers.
+# Splats whose geometry is computed at a time: as many float64 as a register of AVX-512, or else of AVX2, holds. Of more the numbers do not fit
+# into all registers.
 PART = 8 if get_host_cpu_features().get("avx512f") else 4
 
 

@@ -205,10 +205,12 @@ def fill_at_center(view, reshaped, x, y, shape, opacity, compensation, block):
     # alpha = peak·(w - w_end), down to `last_alpha`
     peak = compensated * (1 / (1 - view.w_end))
     offset, last_alpha = peak * view.w_end, maximum(compensated * view.w_cut, view.min_alpha)
-    gain = (last_alpha + offset) / MIN_ALPHA
+    gain = (last_alpha + offset) * (1 / MIN_ALPHA)
     put(block, layout.GAIN, narrow(gain))
     put(block, layout.OFFSET, narrow(offset))
-    return both(drawn, fill_ellipse(x, y, shape, peak / gain, block))
+    if view.w_cut > 0 or view.w_end > 0 or view.min_alpha != MIN_ALPHA:  # otherwise the gain is 1
+        peak = peak / gain
+    return both(drawn, fill_ellipse(x, y, shape, peak, block))
 
 
 @inner
