@@ -33,7 +33,7 @@ FLATTEST, SMALLEST = 12.0, 25.0
 def write_sog(path: Path, columns: Mapping[str, np.ndarray], *, antialiased: bool) -> None:
     """Write the splats of a 3DGS PLY's columns, of SH degree 3 at most, to a new file."""
     count = len(columns["x"])
-    scales, opacities = _stack(columns, "scale_{}", 3), 1 / (1 + np.exp(-columns["opacity"].astype(np.float64)))
+    scales, opacities = _stack(columns, "scale_{}", 3).astype(np.float64), 1 / (1 + np.exp(-columns["opacity"].astype(np.float64)))
     scales = np.maximum(scales, np.maximum(scales.max(1, keepdims=True) - FLATTEST, scales.max() - SMALLEST))
     weights = opacities * np.exp(np.sort(scales - scales.max(), axis=1)[:, 1:].sum(1))  # what a splat covers: where an error shows
     weights = np.maximum(weights / weights.max(), np.finfo(np.float32).tiny) if weights.max() > 0 else np.ones(count)
@@ -45,7 +45,7 @@ def write_sog(path: Path, columns: Mapping[str, np.ndarray], *, antialiased: boo
     textures = {
         "means_l.webp": (places & 255).astype(np.uint8),
         "means_u.webp": (places >> 8).astype(np.uint8),
-        "quats.webp": _rotations(_stack(columns, "rot_{}", 4)),
+        "quats.webp": _rotations(_stack(columns, "rot_{}", 4).astype(np.float64)),
         "scales.webp": length,
         "sh0.webp": np.concatenate([color, alphas[:, None]], 1),
     }
@@ -70,7 +70,7 @@ def write_sog(path: Path, columns: Mapping[str, np.ndarray], *, antialiased: boo
 
 
 def _stack(columns: Mapping[str, np.ndarray], name: str, count: int) -> np.ndarray:
-    return np.stack([columns[name.format(number)] for number in range(count)], 1).astype(np.float64)
+    return np.stack([columns[name.format(number)] for number in range(count)], 1)
 
 
 def _places(means: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -31,13 +31,13 @@ EXCHANGE = {
     "compressed": ("compressed PLY", ".compressed.ply"),
 }
 
-# Suffixes of the formats that are written: by it, but for GLB (`formats.glb`).
+# Suffixes of the formats that are written: by it, but for GLB (`formats.glb`) and SOG (`formats.sog`), which it reads back.
 WRITTEN = (".spz", ".sog", ".compressed.ply", ".glb")
 READ_ONLY = tuple(ending for _, ending in EXCHANGE.values() if ending not in WRITTEN)
 
-# Suffix -> the oldest version of splat-transform that writes it: SOG, by itself or as a ladder with a lod-meta.json, needs the options of
-# `table_options`.
-OLDEST: dict[str, tuple[int, ...]] = {".sog": (3, 0), ".json": (3, 0), ".spz": (2, 1)}
+# Suffix -> the oldest version of splat-transform that is needed: of a lod-meta.json, one that has the options of `streamed_sog`; of a SOG, which
+# `formats.sog` writes, the oldest that was seen to read it back.
+OLDEST: dict[str, tuple[int, ...]] = {".sog": (2, 7), ".json": (3, 0), ".spz": (2, 1)}
 
 # A ladder of SOGs, which viewers stream, and the oldest version of splat-transform that reads it, also as older ones wrote it: its finest level.
 LOD_META, OLDEST_FOR_STREAMED = "lod-meta.json", (3, 2)

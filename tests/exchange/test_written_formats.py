@@ -162,8 +162,8 @@ def test_levels_in_tiles_are_refused_of_such_splats_before_any_work(tmp_path, to
 
 
 def test_a_splat_transform_that_is_too_old_for_sog_is_found_before_the_work(tmp_path, tool):
-    (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\nprint('splat-transform v2.7.1 (b42b60c)', file=sys.stderr)\n")
-    with pytest.raises(SettingsError, match=r"splat-transform 2.7.1 is too old for it, and 3.0 or newer is needed"):
+    (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\nprint('splat-transform v2.6.0 (b42b60c)', file=sys.stderr)\n")
+    with pytest.raises(SettingsError, match=r"splat-transform 2.6.0 is too old for it, and 2.7 or newer is needed"):
         tiny.model().refuse_output(tmp_path / "a.sog", overwrite=False, networks_move=False)
     tiny.model().refuse_output(tmp_path / "a.spz", overwrite=False, networks_move=False)
     (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\nprint('splat-transform v2.0.6', file=sys.stderr)\n")
