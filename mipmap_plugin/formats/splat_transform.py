@@ -253,7 +253,7 @@ def _run(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str
         return str(error)[:160]
     if done.returncode == 0 and target.is_file():
         return ""
-    return _reason(done.stderr + done.stdout) or f"exit code {done.returncode}"
+    return reason_in(done.stderr + done.stdout) or f"exit code {done.returncode}"
 
 
 def _settle_frame(tool: Sequence[str], file: Path, ply: Path) -> None:
@@ -292,7 +292,7 @@ def _is_spz(path: Path) -> bool:
     return path.name.lower().endswith(".spz")
 
 
-def _reason(said: str) -> str:
+def reason_in(said: str) -> str:
     """What splat-transform says went wrong: its line with the error, before a trace and a summary, or else its last one."""
     lines = [line.strip() for line in said.splitlines() if line.strip()]
     errors = [found[1] for line in lines if (found := re.search(r"Error(?: \[\w+\])?: (.*)", line))]

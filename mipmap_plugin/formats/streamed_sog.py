@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any
 
 from mipmap_plugin.errors import OutputError
 from mipmap_plugin.formats.json_file import read_json
-from mipmap_plugin.formats.splat_transform import TOOL, refuse_exchange
+from mipmap_plugin.formats.splat_transform import TOOL, reason_in, refuse_exchange
 from mipmap_plugin.progress import told
 
 # Thousands of splats in a file where there is no GPU: about 1 ms for each splat, at 4 as at 8; twice that at 16.
@@ -27,6 +28,9 @@ SMALLEST_CHUNK = 1
 
 # Adapters that splat-transform lists beside GPUs, and that are processors.
 SOFTWARE = re.compile("llvmpipe|swiftshader|lavapipe|software|basic render", re.IGNORECASE)
+
+# Its last lines that are kept to find out why it failed: an error, a trace and a summary.
+LINES = 100
 
 # A line of splat-transform when it begins a file.
 BEGUN = re.compile(r"\[(\d+)/(\d+)\] (?:\d+_\d+|env)$")
@@ -86,7 +90,7 @@ def _leaves(node: dict[str, Any], levels: int) -> Iterator[Chunk]:
 
 def _followed(command: Sequence[str]) -> str:
     """Run splat-transform, and show the files that it has written of as many as there are. Returns its error message, empty on success."""
-    last = ""
+    said = deque[str](maxlen=LINES)
     try:
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, encoding="utf-8", errors="replace")
     except OSError as error:
@@ -94,10 +98,10 @@ def _followed(command: Sequence[str]) -> str:
     with process, told("writing Streamed SOG", "file") as tell:
         try:
             for line in process.stderr or ():
-                last = line.strip() or last
-                if begun := BEGUN.search(last):
+                said.append(line)
+                if begun := BEGUN.search(line.strip()):
                     tell(int(begun[1]) - 1, int(begun[2]))
         except BaseException:
             process.kill()
             raise
-    return "" if process.returncode == 0 else last[:160] or f"exit code {process.returncode}"
+    return "" if process.returncode == 0 else reason_in("".join(said)) or f"exit code {process.returncode}"
