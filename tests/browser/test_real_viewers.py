@@ -10,11 +10,12 @@ from statistics import fmean
 import numpy as np
 import pytest
 import torch
-from browser import VIEWERS, Browser, BrowserError, missing
+from browser import HERE, VIEWERS, Browser, BrowserError, missing
 
 from mipmap_plugin import Camera, wrap_model
 from mipmap_plugin.demo.run import embedded
 from mipmap_plugin.formats.ply import read_ply, write_ply
+from mipmap_plugin.formats.splat_transform import find_tool
 from mipmap_plugin.scenes.orbits import Orbit
 from mipmap_plugin.wrap import Wrapped
 
@@ -111,6 +112,19 @@ def test_a_view_that_takes_too_long_is_given_up_in_a_sentence(browser: Browser, 
 def test_the_demo_looks_as_we_say(browser: Browser, viewer: str) -> None:
     base = embedded()
     assert likeness(browser, viewer, base, at(base.cameras[:2], 1 / 2)) > ALIKE_IN.get(viewer, ALIKE)
+
+
+@pytest.mark.parametrize(("viewer", "suffix"), [("playcanvas", ".sog"), ("spark", ".sog"), ("spark", ".spz")])
+def test_a_file_of_another_format_looks_as_the_ply(
+    browser: Browser, viewer: str, suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(HERE / "node_modules" / ".bin"), prepend=":")
+    if find_tool() is None:
+        pytest.skip("this needs splat-transform: npm ci --prefix tests/browser")
+    adapted = embedded().adapt(1 / 4, recipe="instant")
+    views = at(adapted.cameras[:2], 1 / 4)
+    first, second = (browser.open(viewer, adapted.save(tmp_path / f"a{ending}")).draw(views, WHITE) for ending in (".ply", suffix))
+    assert all(psnr(one, other) > ALIKE for one, other in zip(first, second, strict=True))
 
 
 @pytest.mark.parametrize("viewer", VIEWERS)
