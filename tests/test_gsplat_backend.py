@@ -32,7 +32,7 @@ WIDE = camera(50, 40, 30.0, 26.0, cx=21.3, cy=18.9)
 FEWER_DIGITS = {f"needle-1e12-{kind}" for kind in ("classic", "antialiased", "mip")}
 LARGER_ALPHA = {f"opacity-{how}-{kind}" for how in ("1", "1-1e-7", "logit-80") for kind in ("classic", "antialiased", "mip")}
 NO_LEAST_COMPENSATION = {f"scale-{size}-antialiased" for size in ("0-on-two-axes", "0-on-three-axes", "1e-20", "1e-20-on-two-axes")} | {
-    "antialiased-1", "antialiased-2",
+    "antialiased-1", "antialiased-2", "gsplat-antialiased-1", "gsplat-antialiased-2",
 }  # fmt: skip
 TWINS_ROOT_AT_ZERO = {"scale-0-on-three-axes-antialiased", "scale-0-on-three-axes-mip", "scale-1e-20-mip"}  # its kernel divides by a little more
 ONLY_BEFORE_TORCH_2_14 = TWINS_ROOT_AT_ZERO | {"scale-1e-20-antialiased"}  # whose gradient of a clamped 0 under a root is NaN
