@@ -101,6 +101,26 @@ def test_numbers_that_have_room_in_a_code_book_are_exact():
     assert len(codes) == 256 and np.array_equal(codes[labels], values)
 
 
+@pytest.mark.parametrize("outlier", [1e3, -1e5, 1e12])
+def test_a_number_far_from_all_others_takes_no_codes_from_them(outlier):
+    values = np.random.default_rng(0).normal(0, 0.5, 6000)
+    values[7] = outlier
+    codes, labels = codebook(values, np.where(values == outlier, 1e-3, 1.0))
+    error = np.abs(codes[labels] - values)
+    assert np.delete(error, 7).mean() < 0.008 and error[7] < 0.05 * abs(outlier)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("length", [14, 20, 27])
+def test_a_huge_splat_leaves_others_their_size_and_an_opacity_may_be_far_below_0(tmp_path, length):
+    columns = columns_of()
+    columns["scale_0"][7], columns["opacity"][8] = length, -1000
+    write_sog(tmp_path / "a.sog", columns, antialiased=False)
+    found = matched(columns, read_sog(tmp_path / "a.sog")[0])
+    error = np.stack([np.delete(np.abs(found[name] - columns[name]), 7) for name in ("scale_0", "scale_1", "scale_2")])
+    assert error.max() < 0.25 and abs(found["scale_0"][7] - length) < 0.01
+
+
 def test_a_splat_without_thickness_takes_no_codes_from_others(tmp_path):
     columns = columns_of()
     columns["scale_0"][::3] = -87
