@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import tiny
+import torch
 from exchange_files import RECORD, SPZ, tool_request
 from ply_files import write
 
@@ -153,6 +154,14 @@ def test_spz_is_not_written_of_splats_that_are_too_far_away_for_it(tmp_path, too
     assert not (tmp_path / "out.glb").exists()
     far.save(tmp_path / "out.compressed.ply", provenance={})
     moved_by(2000.0).save(tmp_path / "out.spz", provenance={})
+
+
+@pytest.mark.parametrize("name", ["a.sog", "a.spz", "a.glb", "a.compressed.ply"])
+def test_no_splats_are_refused_in_a_sentence(tmp_path, tool, name):
+    splats = tiny.gaussians()
+    none = replace(splats, **{part: value[:0] for part, value in vars(splats).items() if torch.is_tensor(value)})
+    with pytest.raises(SettingsError, match=f"{name}: there are no splats to write, which this format needs; give a .ply$"):
+        VanillaModel.from_gaussians(none).save(tmp_path / name, provenance={})
 
 
 def test_levels_in_tiles_are_refused_of_such_splats_before_any_work(tmp_path, tool, capsys, monkeypatch):
