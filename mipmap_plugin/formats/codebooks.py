@@ -6,6 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mipmap_plugin.process.torch_modes import usual_modes
+
 CODES = 256
 
 # Bins of the histogram that codes are placed by, and rounds of k-means that then move them.
@@ -60,6 +62,7 @@ def _moved(codes: np.ndarray, values: np.ndarray, weights: np.ndarray) -> np.nda
     return codes
 
 
+@usual_modes()
 def palette(vectors: np.ndarray, weights: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
     """At most `most` vectors [K, D], and which of them each of the `vectors` [N, D] is rounded to [N]; exact as long as there is room for all.
 

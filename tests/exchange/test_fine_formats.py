@@ -9,6 +9,7 @@ import zipfile
 import numpy as np
 import pytest
 import tiny
+import torch
 from PIL import Image
 
 from mipmap_plugin.formats.codebooks import codebook, palette
@@ -137,6 +138,16 @@ def test_a_palette_with_too_little_room_is_closest_where_the_weight_is():
     error = ((entries[labels] - vectors) ** 2).sum(1)
     assert len(entries) <= 400 and error[:100].mean() < 0.5 < error.mean() < 5
     assert np.array_equal(palette(vectors, weights, 400)[1], labels)
+
+
+def test_a_palette_does_not_depend_on_the_callers_defaults():
+    vectors = np.random.default_rng(0).normal(size=(2000, 9)).astype(np.float32)
+    expected = palette(vectors, np.ones(2000), 400)
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert all(np.array_equal(*pair) for pair in zip(expected, palette(vectors, np.ones(2000), 400), strict=True))
+    finally:
+        torch.set_default_dtype(torch.float32)
 
 
 def test_an_spz_has_its_harmonics_in_8_bits(tmp_path):
