@@ -6,6 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mipmap_plugin.process.torch_modes import usual_modes
+
 CODES = 256
 
 # Bins of the histogram that codes are placed by, and rounds of k-means that then move them.
@@ -13,6 +15,10 @@ BINS, ROUNDS = 4096, 3
 
 # Share of the codes that lie evenly over the whole range, so that none is far from any number, whatever its weight.
 EVEN = 0.5
+
+# Of the values' usual range, the shares from which to which it goes, and as many times as it ranges they are placed by differences. Beyond, they are
+# placed by ratios: one value that is very far away would leave all others in a single bin.
+USUAL, NEAR = (0.01, 0.99), 30
 
 # The seed of what is drawn: the same splats give the same bytes.
 SEED = 0
@@ -35,6 +41,8 @@ def codebook(values: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.nd
 
 def _placed(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Codes whose density is the cube root of that of the weights, which makes the error least, mixed with an even one."""
+    middle, near = np.median(values), NEAR * np.ptp(np.quantile(values, USUAL)) or np.ptp(values)
+    values = np.arcsinh((values - middle) / near)
     low, high = values.min(), values.max()
     bins = ((values - low) / (high - low) * (BINS - 1)).astype(np.int64)
     density = np.cbrt(np.bincount(bins, weights, BINS))
@@ -42,7 +50,7 @@ def _placed(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     mixed = EVEN / BINS + (1 - EVEN) * density / total if total > 0 else np.full(BINS, 1 / BINS)
     reached = np.concatenate([[0.0], mixed.cumsum()])
     wanted = (np.arange(CODES) + 0.5) / CODES * reached[-1]
-    codes: np.ndarray = low + (high - low) * np.interp(wanted, reached, np.linspace(0, 1, BINS + 1))
+    codes: np.ndarray = middle + near * np.sinh(low + (high - low) * np.interp(wanted, reached, np.linspace(0, 1, BINS + 1)))
     return codes
 
 
@@ -54,6 +62,7 @@ def _moved(codes: np.ndarray, values: np.ndarray, weights: np.ndarray) -> np.nda
     return codes
 
 
+@usual_modes()
 def palette(vectors: np.ndarray, weights: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
     """At most `most` vectors [K, D], and which of them each of the `vectors` [N, D] is rounded to [N]; exact as long as there is room for all.
 

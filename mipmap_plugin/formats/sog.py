@@ -33,8 +33,8 @@ FLATTEST, SMALLEST = 12.0, 25.0
 def write_sog(path: Path, columns: Mapping[str, np.ndarray], *, antialiased: bool) -> None:
     """Write the splats of a 3DGS PLY's columns, of SH degree 3 at most, to a new file."""
     count = len(columns["x"])
-    scales, opacities = _stack(columns, "scale_{}", 3).astype(np.float64), 1 / (1 + np.exp(-columns["opacity"].astype(np.float64)))
-    scales = np.maximum(scales, np.maximum(scales.max(1, keepdims=True) - FLATTEST, scales.max() - SMALLEST))
+    opacities = (1 + np.tanh(columns["opacity"].astype(np.float64) / 2)) / 2
+    scales = _visible(_stack(columns, "scale_{}", 3).astype(np.float64))
     weights = opacities * np.exp(np.sort(scales - scales.max(), axis=1)[:, 1:].sum(1))  # what a splat covers: where an error shows
     weights = np.maximum(weights / weights.max(), np.finfo(np.float32).tiny) if weights.max() > 0 else np.ones(count)
     places, low, high = _places(np.stack([columns[axis] for axis in "xyz"], 1).astype(np.float64))
@@ -71,6 +71,14 @@ def write_sog(path: Path, columns: Mapping[str, np.ndarray], *, antialiased: boo
 
 def _stack(columns: Mapping[str, np.ndarray], name: str, count: int) -> np.ndarray:
     return np.stack([columns[name.format(number)] for number in range(count)], 1)
+
+
+def _visible(scales: np.ndarray) -> np.ndarray:
+    """Log scales [N, 3], of which those that are too small to tell apart are made equal."""
+    longest = scales.max(1, keepdims=True)
+    smallest = min(longest.max() - SMALLEST, np.median(longest) - FLATTEST)  # a huge splat must not be what others are compared with
+    visible: np.ndarray = np.maximum(scales, np.maximum(longest - FLATTEST, smallest))
+    return visible
 
 
 def _places(means: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

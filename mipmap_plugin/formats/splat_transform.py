@@ -93,11 +93,10 @@ def refuse_exchange(path: Path) -> list[str]:
     tool = find_tool()
     if tool is None:
         instead = "; or give a .ply" if is_written(path) else ""  # of a file; the name of a folder may have a dot
-        raise SettingsError(f"{path}: this format is written by {TOOL}, which is not installed; run: {INSTALL}{instead}")
+        raise SettingsError(f"{path}: this format takes {TOOL}, which is not installed; run: {INSTALL}{instead}")
     oldest = OLDEST.get(path.suffix.lower(), ())
     if reason := _too_old(tool, oldest):
-        instead = " a .spz or" if oldest >= (3, 0) else ""
-        raise SettingsError(f"{path}: {reason}; or give{instead} a .ply")
+        raise SettingsError(f"{path}: {reason}; or {'leave Streamed SOG out' if path.name == LOD_META else 'give a .ply'}")
     return tool
 
 

@@ -1,4 +1,4 @@
-"""Splats in an exchange format: converted to PLY by splat-transform when read, and back when written."""
+"""Splats in an exchange format: converted to PLY by splat-transform when read, and back when written, except to SOG."""
 
 from __future__ import annotations
 

@@ -68,7 +68,9 @@ def _is_of_a_training(ply: Path) -> bool:
 
 def refuse_format(path: Path, trained: TrainedScale, means: Tensor) -> None:
     """Raise SettingsError for an exchange format at `path` if the splats need the screen filter of their training, or if it cannot be written, or has
-    no place for their centers `means` [N, 3]."""
+    no place for their centers `means` [N, 3], or if there are none."""
+    if not len(means):
+        raise SettingsError(f"{path}: there are no splats to write, which this format needs; give a .ply")
     if trained.keeps_filter:
         own = f"the filter of their own project ({trained.screen_filter}, {trained.eps2d:g} px²)"
         raise SettingsError(f"{path}: these splats need {own}; give a .ply or a folder, or adapt for a viewer if the family allows it")

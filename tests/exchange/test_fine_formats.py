@@ -9,6 +9,7 @@ import zipfile
 import numpy as np
 import pytest
 import tiny
+import torch
 from PIL import Image
 
 from mipmap_plugin.formats.codebooks import codebook, palette
@@ -101,6 +102,26 @@ def test_numbers_that_have_room_in_a_code_book_are_exact():
     assert len(codes) == 256 and np.array_equal(codes[labels], values)
 
 
+@pytest.mark.parametrize("outlier", [1e3, -1e5, 1e12])
+def test_a_number_far_from_all_others_takes_no_codes_from_them(outlier):
+    values = np.random.default_rng(0).normal(0, 0.5, 6000)
+    values[7] = outlier
+    codes, labels = codebook(values, np.where(values == outlier, 1e-3, 1.0))
+    error = np.abs(codes[labels] - values)
+    assert np.delete(error, 7).mean() < 0.008 and error[7] < 0.05 * abs(outlier)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("length", [14, 20, 27])
+def test_a_huge_splat_leaves_others_their_size_and_an_opacity_may_be_far_below_0(tmp_path, length):
+    columns = columns_of()
+    columns["scale_0"][7], columns["opacity"][8] = length, -1000
+    write_sog(tmp_path / "a.sog", columns, antialiased=False)
+    found = matched(columns, read_sog(tmp_path / "a.sog")[0])
+    error = np.stack([np.delete(np.abs(found[name] - columns[name]), 7) for name in ("scale_0", "scale_1", "scale_2")])
+    assert error.max() < 0.25 and abs(found["scale_0"][7] - length) < 0.01
+
+
 def test_a_splat_without_thickness_takes_no_codes_from_others(tmp_path):
     columns = columns_of()
     columns["scale_0"][::3] = -87
@@ -117,6 +138,16 @@ def test_a_palette_with_too_little_room_is_closest_where_the_weight_is():
     error = ((entries[labels] - vectors) ** 2).sum(1)
     assert len(entries) <= 400 and error[:100].mean() < 0.5 < error.mean() < 5
     assert np.array_equal(palette(vectors, weights, 400)[1], labels)
+
+
+def test_a_palette_does_not_depend_on_the_callers_defaults():
+    vectors = np.random.default_rng(0).normal(size=(2000, 9)).astype(np.float32)
+    expected = palette(vectors, np.ones(2000), 400)
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert all(np.array_equal(*pair) for pair in zip(expected, palette(vectors, np.ones(2000), 400), strict=True))
+    finally:
+        torch.set_default_dtype(torch.float32)
 
 
 def test_an_spz_has_its_harmonics_in_8_bits(tmp_path):

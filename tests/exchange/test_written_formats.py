@@ -9,10 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import tiny
+import torch
 from exchange_files import RECORD, SPZ, tool_request
 from ply_files import write
 
 from mipmap_plugin.cli import main
+from mipmap_plugin.commands.ladders import Exports
 from mipmap_plugin.errors import OutputError, SettingsError
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.splat_transform import refuse_unread
@@ -154,6 +156,14 @@ def test_spz_is_not_written_of_splats_that_are_too_far_away_for_it(tmp_path, too
     moved_by(2000.0).save(tmp_path / "out.spz", provenance={})
 
 
+@pytest.mark.parametrize("name", ["a.sog", "a.spz", "a.glb", "a.compressed.ply"])
+def test_no_splats_are_refused_in_a_sentence(tmp_path, tool, name):
+    splats = tiny.gaussians()
+    none = replace(splats, **{part: value[:0] for part, value in vars(splats).items() if torch.is_tensor(value)})
+    with pytest.raises(SettingsError, match=f"{name}: there are no splats to write, which this format needs; give a .ply$"):
+        VanillaModel.from_gaussians(none).save(tmp_path / name, provenance={})
+
+
 def test_levels_in_tiles_are_refused_of_such_splats_before_any_work(tmp_path, tool, capsys, monkeypatch):
     monkeypatch.setattr("mipmap_plugin.levels.ladder.make_levels", None)
     moved_by(5e5).save(tmp_path / "city.ply", provenance={})
@@ -169,6 +179,14 @@ def test_a_splat_transform_that_is_too_old_for_sog_is_found_before_the_work(tmp_
     (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\nprint('splat-transform v2.0.6', file=sys.stderr)\n")
     with pytest.raises(SettingsError, match=r"2.0.6 is too old for it, and 2.1 or newer is needed; run: npm install -g \S+; or give a .ply"):
         tiny.model().refuse_output(tmp_path / "a.spz", overwrite=False, networks_move=False)
+    with pytest.raises(SettingsError, match=r"3.0 or newer is needed, which needs Node.js 22; run: npm install -g \S+; or leave Streamed SOG out$"):
+        Exports(streamed_sog=True, tiles=False, canvas=512).check(tmp_path)
+
+
+def test_without_splat_transform_a_sog_is_not_said_to_be_written_by_it(tmp_path, tool):
+    (tool / "splat-transform").unlink()
+    with pytest.raises(SettingsError, match=r"a.sog: this format takes splat-transform, which is not installed; .*; or give a .ply$"):
+        tiny.model().refuse_output(tmp_path / "a.sog", overwrite=False, networks_move=False)
 
 
 @pytest.fixture
