@@ -112,6 +112,15 @@ def test_photographs_of_nerfstudio_judge_a_base_of_colmaps_world(tmp_path, turne
     assert wrap_model(tiny.model()).place(scene) is scene
 
 
+@pytest.mark.parametrize(("there", "here", "turned"), [(12, 2, True), (2, 12, True), (12, 12, False)])
+def test_applied_transform_is_taken_back_for_some_of_the_views_and_not_for_cameras_of_a_third_world(tmp_path, there, here, turned):
+    applied = torch.tensor([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
+    views, third = tiny.cameras(12), torch.diag(torch.tensor([-0.3, -0.3, 0.3, 1], dtype=torch.float64))
+    scene = Scene(tuple(view.moved(applied) for view in views[:there]), {}, tmp_path, [], applied=applied)
+    base = wrap_model(tiny.model(), cameras=[view if turned else view.moved(third) for view in views[:here]])
+    assert (base.place(scene) is not scene) == turned
+
+
 def test_gsplat_holds_out_the_views_that_its_options_say(tmp_path):
     """Not every eighth where test_every is another number: a view that was trained on is no test view."""
     cameras = tuple(replace(view, name=f"{i:02d}", split="train" if i % 8 else "test") for i, view in enumerate(tiny.cameras(10)))

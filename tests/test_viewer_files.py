@@ -77,6 +77,18 @@ def test_it_is_another_renderer_where_a_view_shows_a_splat_between_both_near_pla
         assert model.targets(viewer, views[:2])[viewer] == model.effects()
 
 
+def test_splats_are_activated_once_for_all_views_that_near_planes_are_looked_at_from(monkeypatch):
+    """A million of them take longer than what is drawn of them: half a minute for 300 views."""
+    views, splats, asked = tiny.cameras(6), tiny.gaussians(40), []
+    beside = torch.tensor([9, 0, 0.1], dtype=torch.float64)
+    splats.means[:6] = torch.stack([view.center + beside @ view.viewmat[:3, :3] for view in views])
+    model = wrap_model(VanillaModel.from_gaussians(splats, TrainedScale()), cameras=views)
+    model.effects()  # which looks at the splats, too
+    gaussians = model.model.gaussians
+    monkeypatch.setattr(model.model, "gaussians", lambda view: asked.append(view) or gaussians(view))
+    assert model.target("gsplat") == model.effects() and len(asked) == 1
+
+
 def test_a_base_whose_near_planes_were_looked_at_is_freed_at_once():
     model = wrapped()
     gc.collect()

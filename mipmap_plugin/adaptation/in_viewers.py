@@ -13,6 +13,7 @@ from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.progress import announced
 from mipmap_plugin.splatting.packing import in_two_steps, packed
 
 # Views and splats that are looked at for what a viewer's positions do, and the fraction of the splats that has to be displaced for a word about it.
@@ -38,15 +39,17 @@ class NearPlanes:
             self.known[asked] = self._alike(effects.near_plane, seen)
         return self.trained if self.known[asked] else effects
 
+    @announced("examining views")
     @torch.no_grad()
     def _alike(self, near: float, views: Sequence[Camera]) -> bool:
         nearest, farthest = sorted((near, self.trained.near_plane))
         effects, means, (backend, _) = replace(self.trained, near_plane=nearest), self.base.parameters()["means"], self.choice()
+        once = self.base.gaussians(views[0]) if self.base.traits.same_for_all_views else None
         for view in views:
-            depths = view.to_camera(means)[:, 2]
+            depths = (means - view.center.to(means)) @ view.viewmat[2, :3].to(means)
             between = (depths > nearest) & (depths <= farthest)
             # Most of them lie beside the picture: what they show tells.
-            if between.any() and backend.render(self.base.gaussians(view)[between], view, effects).alpha.any():
+            if between.any() and backend.render((once or self.base.gaussians(view))[between], view, effects).alpha.any():
                 return False
         return True
 

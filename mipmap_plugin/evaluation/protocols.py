@@ -165,11 +165,11 @@ def test_views(scene: Scene, base: Sequence[Camera], background: tuple[float, fl
 
 
 def not_held_out(model: Wrapped, scene: Scene) -> list[str]:
-    """A note, if a placed scene (`Wrapped.place`) marks no view as test, or the base was trained on those that are."""
+    """A note, if a placed scene (`Wrapped.place`) marks no photograph as test, or the base was trained on those that are."""
     views, judged, options = len(_photographed(scene)), _judged(scene, model.cameras), read_options(model.model.folder)[0]
     seen = len(views_seen(judged, _split(model.cameras, "train")))
     if not _split(judged, "test"):
-        unmarked = f"{scene.source.name}: no view is marked as for testing, so of {views} photographs"
+        unmarked = f"{scene.source.name}: no photograph is marked as for testing, so of {views} photographs"
         if len(judged) < views:
             return [f"{unmarked} those are taken that the checkpoint holds out: {len(judged)}"]
         trained = f"all are taken: {seen} have poses that the checkpoint counts as its training's"

@@ -84,8 +84,8 @@ def test_evaluate_says_that_the_base_was_trained_on_what_is_judged(run, model_fo
     marked = tiny.scene(tmp_path / "marked", test=[*test, replace(train[1], split="test")])
     (unmarked / "transforms_test.json").unlink()
     (unmarked / "transforms_train.json").rename(unmarked / "transforms.json")
-    no_split = "scene: no view is marked as for testing, so of 4 photographs those are taken that the checkpoint holds out: 1"
-    all_of_them = "scene: no view is marked as for testing, so of 4 photographs all are taken: 4 have poses that the checkpoint counts as"
+    no_split = "scene: no photograph is marked as for testing, so of 4 photographs those are taken that the checkpoint holds out: 1"
+    all_of_them = "scene: no photograph is marked as for testing, so of 4 photographs all are taken: 4 have poses that the checkpoint counts as"
     both = "cfg_args says no --eval: the checkpoint was trained on 2 of 2 photographed test views, so that no row, the base's included, is held out"
     halves = "cfg_args says --train_test_exp: the checkpoint was trained on half of each of 1 of 2 photographed test views"
     for options, scene, judged, note in [
@@ -104,6 +104,16 @@ def test_evaluate_says_that_the_base_was_trained_on_what_is_judged(run, model_fo
         told = json.loads(out)
         assert told["judged_views"] == [judged] and len(told["notes"]) == (note is not None)
         assert note is None or told["notes"][0].startswith(note)
+
+
+def test_evaluate_does_not_say_that_no_view_is_for_testing_where_their_photographs_are_absent(run, model_folder, tmp_path):
+    scene = tiny.scene(tmp_path / "scene", train=tiny.cameras(3))
+    for photograph in (scene / "test").iterdir():
+        photograph.unlink()
+    code, out, err = run("evaluate", model_folder, "--images", scene, "--scale", "1", "--no-report", "--json")
+    assert code == 0, err
+    absent, unmarked = json.loads(out)["notes"]
+    assert absent.startswith("transforms_test.json: 2 listed images are absent") and "scene: no photograph is marked as for testing" in unmarked
 
 
 def test_evaluate_averages_several_scenes_and_prints_the_published_rows(run, model_folder, tmp_path):

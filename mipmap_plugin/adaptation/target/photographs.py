@@ -22,6 +22,9 @@ from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.scenes import DEFORMABLE, Scene, load_photographs
 from mipmap_plugin.scenes.base import SHAPE_TOLERANCE, SPLIT
 
+# Cameras are in a world if they are nearer to its cameras than to those of the other by this factor: in neither, one is nearer by chance.
+FAR_NEARER = 0.1
+
 
 class Photographs:
     """The training images of a scene at the pixel density of the base, and their cameras."""
@@ -123,13 +126,14 @@ def placed(model: SplatModel, scene: Scene, cameras: Sequence[Camera] = ()) -> S
 def _unapplied(scene: Scene, cameras: Sequence[Camera]) -> Scene:
     """The scene in COLMAP's world if the base's `cameras` are there and not in that of nerfstudio's file, which was turned (`Scene.applied`)."""
     original = scene.original()
-    if original is scene or not cameras or not _apart(original, cameras) < _apart(scene, cameras):
+    if original is scene or not cameras or not _apart(original, cameras) < FAR_NEARER * _apart(scene, cameras):
         return scene
     note = "its applied_transform is taken back, for the checkpoint's cameras are where these were before it"
     return replace(original, notes=[*original.notes, note])
 
 
 def _apart(scene: Scene, cameras: Sequence[Camera]) -> float:
-    """How far from each other the nearest cameras of a scene and of a base are, median, in world units."""
+    """How far cameras of a scene and of a base are from the nearest of the other, median, in world units; one may have but some of the other's."""
     there, here = (torch.stack([camera.center for camera in each]) for each in (scene.cameras, cameras))
-    return float(torch.cdist(there, here, compute_mode="donot_use_mm_for_euclid_dist").amin(1).median())
+    distances = torch.cdist(there, here, compute_mode="donot_use_mm_for_euclid_dist")
+    return min(float(distances.amin(axis).median()) for axis in (0, 1))
