@@ -23,6 +23,9 @@ MOST_ENTRIES, IN_A_ROW = 1 << 16, 64
 # Steps of a coordinate, and of a rotation's and an opacity's number.
 PLACES, LEVELS = 65535, 255
 
+# Who may read a file that is unpacked, as of Unix: all, or a web server could not.
+READABLE = 0o644
+
 # Which three numbers of a quaternion (w, x, y, z) are stored where that of each index is the largest, and the byte that says so.
 OTHERS, LARGEST_IS_W = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]), 252
 
@@ -66,7 +69,9 @@ def write_sog(path: Path, columns: Mapping[str, np.ndarray], *, antialiased: boo
     files |= {name: lossless_webp(_image(values[order])) for name, values in textures.items()}
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in (*files.items(), ("meta.json", json.dumps(meta).encode())):
-            archive.writestr(zipfile.ZipInfo(name), content)  # without the time, so that the same splats give the same bytes
+            entry = zipfile.ZipInfo(name)  # without the time, so that the same splats give the same bytes
+            entry.external_attr = READABLE << 16
+            archive.writestr(entry, content)
 
 
 def _stack(columns: Mapping[str, np.ndarray], name: str, count: int) -> np.ndarray:

@@ -36,7 +36,7 @@ def read_sog(path):
     """The columns of a SOG, by its specification, and its meta.json."""
     with zipfile.ZipFile(path) as archive:
         meta = json.loads(archive.read("meta.json"))
-        assert all(info.compress_type == zipfile.ZIP_STORED for info in archive.infolist())
+        assert all((info.compress_type, info.external_attr >> 16) == (zipfile.ZIP_STORED, 0o644) for info in archive.infolist())
         images = {name: as_rgba(archive.read(name)) for name in archive.namelist() if name.endswith("webp")}
     flat = {name: image.reshape(-1, 4)[: meta["count"]] for name, image in images.items()}
     low, high = (np.array(meta["means"][end]) for end in ("mins", "maxs"))
