@@ -16,8 +16,8 @@ BINS, ROUNDS = 4096, 3
 # Share of the codes that lie evenly over the whole range, so that none is far from any number, whatever its weight.
 EVEN = 0.5
 
-# Of the values' usual range, the shares from which to which it goes, and as many times as it ranges they are placed by differences. Beyond, they are
-# placed by ratios: one value that is very far away would leave all others in a single bin.
+# The usual range of values goes from the first of these shares of them to the second. Codes are placed by differences within so many times that range
+# of the median, and by ratios beyond: one value that is very far away would leave all others in a single bin.
 USUAL, NEAR = (0.01, 0.99), 30
 
 # The seed of what is drawn: the same splats give the same bytes.
