@@ -10,4 +10,4 @@ from mipmap_plugin.levels.distance.chunks import Chunks
 def small_chunks(monkeypatch):
     """The scenes here have hardly more splats than the smallest chunk of splat-transform."""
     cut = Chunks.of
-    monkeypatch.setattr(chunks_module.Chunks, "of", classmethod(lambda _, splats, extent: cut(splats, extent, least=16)))
+    monkeypatch.setattr(chunks_module.Chunks, "of", classmethod(lambda _, splats, extent, least=None: cut(splats, extent, least=16)))

@@ -18,7 +18,7 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.levels.distance.chunks import Chunks, shrunk
 from mipmap_plugin.levels.distance.ladder import by_distance, scene_of
-from mipmap_plugin.levels.distance.mixture import together
+from mipmap_plugin.levels.distance.mixture import Mixture, together
 from mipmap_plugin.levels.distance.rule import DistanceRule, focal, is_unbounded, nearest
 from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground
 from mipmap_plugin.levels.distance.yardstick import Walks
@@ -156,6 +156,37 @@ def test_of_two_boxes_the_larger_is_the_usual_one():
 def test_splats_in_one_place_are_one_chunk():
     splats = tiny.gaussians(50)
     assert len(Chunks.of(replace(splats, means=torch.zeros_like(splats.means)), extent=0.1, least=10)) == 1
+
+
+def test_finished_levels_are_cut_together_as_they_are_streamed():
+    """splat-transform halves the splats of all levels, those with the lowest places along the longest side first; its chunks have all levels."""
+    levels = [tiny.gaussians(count, degree=0, seed=count) for count in (1801, 700, 300)]
+    means = torch.cat([level.means for level in levels])
+
+    def cut(rows):
+        sides = means[rows].amax(0) - means[rows].amin(0)
+        if len(rows) <= 1024 or sides.max() <= 0.5:
+            return [rows]
+        rising = rows[means[rows, sides.argmax()].argsort()]
+        return [*cut(rising[: len(rows) // 2]), *cut(rising[len(rows) // 2 :])]
+
+    expected = cut(torch.arange(len(means)))
+    mixture = Mixture.streamed(RULE, 0.5, levels)
+    places = torch.cat(list(mixture.places))
+    assert len(mixture.chunks) == len(expected) == 4
+    assert all(len(set(places[rows].tolist())) == 1 and int((places == places[rows[0]]).sum()) == len(rows) for rows in expected)
+
+
+def test_walks_are_measured_with_the_chunks_that_are_streamed(small_chunks):
+    """Those of the base alone are for making the levels: another one has its splats elsewhere."""
+    base, request = wrapped(), LadderRequest("classic", coarsest=1 / 4, ratio=2.0, by="distance")
+    scene = scene_of(base, request, request.first_band(base.target("classic"), base.effects()))
+    levels = [base.model, *[VanillaModel.from_gaussians(scene.splats[:150], base.model.trained)] * (scene.rule.count - 1)]
+    streamed = Mixture.streamed(scene.rule, scene.extent, [scene.splats_of(level) for level in levels])
+    seen = Walks(scene, levels).seen(scene.views[0], scene.rule.middle(1))
+    camera = backed(scene.views[0], seen.way)
+    assert seen.splats == len(streamed.splats(camera))
+    assert seen.splats != len(Mixture.of(scene.rule, scene.chunks, streamed.levels).splats(camera))
 
 
 # Walks

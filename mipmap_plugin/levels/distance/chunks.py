@@ -7,11 +7,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from mipmap_plugin.formats.streamed_sog import SMALLEST_CHUNK
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.rotations import rotations
 
-# Splats of a chunk that is not cut any further, whatever its size (splat-transform's b-tree).
-LEAST = 256
+# Splats of a chunk, of all levels together, that splat-transform does not cut any further, whatever its size.
+LEAST = 1024 * SMALLEST_CHUNK
+
+# The same of the base alone, before there are levels: a ladder has some times as many.
+LEAST_OF_BASE = LEAST // 4
 
 # PlayCanvas's `lodDistanceShrink`: the part that is left out of distances of what a box's side is longer than those of half of the chunks. A few
 # large splats would make a box so long that a camera is always inside.
@@ -28,7 +32,7 @@ class Chunks:
 
     @classmethod
     def of(cls, gaussians: Gaussians, extent: float, least: int = LEAST) -> Chunks:
-        """Cut splats at the median of their longest side until a chunk measures at most `extent` or has at most `least`.
+        """Cut splats of all levels at the median of their longest side until a chunk measures at most `extent` or has at most `least`.
 
         A box holds its splats up to one standard deviation, as splat-transform's do, less what PlayCanvas shrinks it by.
         """
@@ -41,7 +45,7 @@ class Chunks:
             if len(rows) <= least or sides[axis] <= extent:
                 leaves.append(rows)
                 return -len(leaves)
-            place = float(means[rows, axis].median())
+            place = float(means[rows, axis].kthvalue(len(rows) // 2).values)
             below = means[rows, axis] <= place
             if below.all():  # more than half lie in one plane: no cut can part them
                 leaves.append(rows)

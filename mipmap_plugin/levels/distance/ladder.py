@@ -13,7 +13,7 @@ from mipmap_plugin.adaptation.pixel_size import seen_pixel_size
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.contents import LeftOut
-from mipmap_plugin.levels.distance.chunks import Chunks
+from mipmap_plugin.levels.distance.chunks import LEAST_OF_BASE, Chunks
 from mipmap_plugin.levels.distance.level import AS_FINER, LevelRun
 from mipmap_plugin.levels.distance.manifest import Contents, write
 from mipmap_plugin.levels.distance.rule import DistanceRule, is_unbounded, nearest
@@ -101,7 +101,7 @@ def scene_of(base: FrozenBase, request: LadderRequest, band: Band) -> Scene:
         pixels = seen_pixel_size(splats.means, views, base.effects().near_plane)
         rule = DistanceRule.of(pixels, request, band)
         extent = chunk_extent(nearest(pixels) * focal_of(views[0]))
-        return Scene(base, request, rule, Chunks.of(splats, extent), extent, base.target(request.viewer), backend, note)
+        return Scene(base, request, rule, Chunks.of(splats, extent, LEAST_OF_BASE), extent, base.target(request.viewer), backend, note)
 
 
 def chunk_extent(distance: float) -> int:

@@ -29,6 +29,12 @@ class Mixture:
         """Levels whose splats lie in the chunk of their center."""
         return cls(rule, chunks, levels, [chunks.of_points(level.means.detach()) for level in levels])
 
+    @classmethod
+    def streamed(cls, rule: DistanceRule, extent: float, levels: Sequence[Gaussians]) -> Mixture:
+        """Levels that are all made, cut together into chunks of this extent, as splat-transform writes them."""
+        colorless = [replace(level, sh=level.sh[:, :1]) for level in levels]  # which spares a copy of what is largest
+        return cls.of(rule, Chunks.of(together(colorless), extent), levels)
+
     def shown(self, camera: Camera) -> Tensor:
         """The level at which the camera sees each chunk, [C]."""
         return self.rule.level(self.chunks.distances(camera.center) / focal(camera))

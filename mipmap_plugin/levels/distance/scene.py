@@ -39,7 +39,7 @@ class Scene:
     base: FrozenBase
     request: LadderRequest
     rule: DistanceRule
-    chunks: Chunks
+    chunks: Chunks  # of the base alone: what levels are made with
     extent: int  # world units, of a chunk
     target: Effects
     backend: Backend

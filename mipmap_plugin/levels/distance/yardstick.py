@@ -66,7 +66,7 @@ class Walks:
         seeing = [view for view in (*jittered(around, VIEWS, generator), *scene.views) if math.isfinite(self._depth(view, scene))]
         self.views = seeing[:VIEWS]
         self._truth = WalkTruth((scene.splats, scene.backend, scene.base.effects()), scene.views, {}, SAMPLES)
-        self._scene, self._mixture = scene, Mixture.of(scene.rule, scene.chunks, [scene.splats_of(model) for model in levels])
+        self._scene, self._mixture = scene, Mixture.streamed(scene.rule, scene.extent, [scene.splats_of(model) for model in levels])
 
     @torch.no_grad()
     def seen(self, view: Camera, size: float) -> Seen:
