@@ -44,8 +44,8 @@ VIEWS = (0, 40)
 # dB between our picture of a level and the engine's, which SOG's rounding is in; 47 to 56 were measured. Of other levels it is at least so much less.
 ALIKE, APART = 43.0, 10.0
 
-# dB that a picture may lack while chunks that the camera came near to replace others: 2 were measured after four pictures.
-UNSETTLED = 3.0
+# The same of pictures of a ladder by distance, most of which mix levels: 43 to 54 were measured.
+MIXED = 42.0
 
 
 @pytest.fixture(scope="module")
@@ -152,25 +152,19 @@ def test_a_level_looks_as_we_say_from_where_it_is_shown(
 
 
 def test_levels_by_distance_are_shown_as_they_were_made_for(browser: Browser, by_distance: tuple[Path, Ladder]) -> None:
-    """A walk nearer: chunk by chunk the engine changes levels about where we say, and its pictures of whole levels are ours."""
+    """A walk nearer: the engine shows the splats of each level that we say, and its pictures are ours."""
     folder, made = by_distance
     scene, settings = made.contents.scene, json.loads((folder / STREAMED / SETTINGS).read_text())
     page = opened(browser, folder, settings)
-    mixture = Mixture.of(scene.rule, scene.chunks, [scene.splats_of(level.model) for level in made.levels])
-    distances = settings["lodBaseDistance"] * np.geomspace(2 * settings["lodMultiplier"], 0.6, 16)
-    parts, seen = np.zeros((2, len(distances), len(made.levels))), set[int]()
-    for number, distance in enumerate(distances):
+    mixture = Mixture.streamed(scene.rule, scene.extent, [scene.splats_of(level.model) for level in made.levels])
+    mixed = 0
+    for distance in settings["lodBaseDistance"] * np.geomspace(2 * settings["lodMultiplier"], 0.6, 16):
         camera = walked(float(distance))
-        real = page.draw([camera] * 4, WHITE)[-1]  # the first ones still change
+        (real,) = page.draw([camera], WHITE)
         chunks, engines = mixture.shown(camera), page.levels()
         counts = [int((chunks[place] == level).sum()) for level, place in enumerate(mixture.places)]
-        for row, shown in zip(parts, (engines, counts), strict=True):
-            row[number, : len(shown)] = [count / len(level) for count, level in zip(shown, mixture.levels, strict=False)]
-        if parts[:, number].max(axis=1).min() == 1:
-            ours = scene.backend.render(mixture.splats(camera), camera, scene.target).image.clamp(0, 1).numpy()
-            assert -10 * np.log10(np.square(ours - real).mean()) > ALIKE - UNSETTLED
-            seen.add(int(parts[0, number].argmax()))
-    assert seen == set(range(len(made.levels)))
-    for coarser in range(1, len(made.levels)):
-        halves = [np.exp(np.interp(0.5, row[::-1, coarser:].sum(1), np.log(distances[::-1]))) for row in parts]
-        assert halves[0] == pytest.approx(halves[1], rel=NEARLY)
+        assert engines + [0] * (len(counts) - len(engines)) == counts
+        ours = scene.backend.render(mixture.splats(camera), camera, scene.target).image.clamp(0, 1).numpy()
+        assert -10 * np.log10(np.square(ours - real).mean()) > MIXED
+        mixed += np.count_nonzero(counts) > 1
+    assert mixed > 3

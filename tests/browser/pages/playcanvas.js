@@ -99,11 +99,12 @@ function octrees(app, eye) {
   return managersOf(app, eye).flatMap(({ world }) => [...world._octreeInstances.values()])
 }
 
-// Whether every chunk of a streamed file shows the level that it should from here; the engine looks every tenth frame.
+// Whether every chunk of a streamed file shows the level that it should from here. The engine looks every tenth frame, and draws what it then found
+// ten frames later.
 function isStreamed(app, eye) {
   const isNear = ({ world }) => world._lastLodCameraPos.distance(eye.getPosition()) <= app.scene.gsplat.lodUpdateDistance
   const isShown = ({ currentLod, optimalLod }) => optimalLod >= 0 && currentLod === optimalLod
-  const isWhole = (instance) => instance.pendingLoadCount === 0 && instance.nodeInfos.every(isShown)
+  const isWhole = (instance) => !instance.dirtyModifiedPlacements && instance.pendingLoadCount === 0 && instance.nodeInfos.every(isShown)
   const all = octrees(app, eye)
   return all.length === 0 || (managersOf(app, eye).every(isNear) && all.every(isWhole))
 }
