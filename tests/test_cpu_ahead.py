@@ -38,9 +38,9 @@ def two_threads_and_nothing_started(monkeypatch):
     monkeypatch.setattr(ahead.threads, "for_kernels", lambda: 2)
     monkeypatch.setattr(ahead.os, "cpu_count", lambda: 2)
     monkeypatch.setattr(ahead.subprocess, "Popen", Process)
-    ahead.start.cache_clear()
+    ahead._started.clear()
     yield
-    ahead.start.cache_clear()
+    ahead._started.clear()
 
 
 def test_nothing_is_started_where_the_cache_has_the_kernels(monkeypatch):
@@ -60,6 +60,22 @@ def test_the_process_is_started_once_and_waited_for(monkeypatch):
     ahead.wait(False, Effects(3))
     assert process is ahead.start(False, Effects(3))
     assert process.waited_for
+
+
+def test_effects_that_call_the_same_kernels_start_one_process(monkeypatch):
+    monkeypatch.setattr(ahead, "_are_compiled", lambda: False)
+    assert ahead.start(False, Effects(3)) is ahead.start(False, Effects(3, eps2d=0.1))
+    assert ahead.start(False, Effects(3)) is not ahead.start(True, Effects(3))
+
+
+def test_what_merging_calls_is_compiled_after_the_backward_pass(monkeypatch):
+    monkeypatch.setattr(ahead, "_are_compiled", lambda: False)
+    sent = pickle.loads(ahead.start(False, Effects(0), merging=True).stdin.written)
+    called = []
+    for module, name in ((ahead.drawing, "draw_back"), (ahead.looking, "areas"), (ahead.pairing, "nearest_along"), (ahead.weighing, "weigh")):
+        monkeypatch.setattr(module, name, lambda *arguments, name=name, **named: called.append(name))
+    ahead.compile_back(*sent)
+    assert called == ["draw_back", "areas", "nearest_along", "weigh"]
 
 
 @pytest.mark.parametrize("has_covariances", [False, True])

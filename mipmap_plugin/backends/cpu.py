@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Needs, Rendered, Stepper
+from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Calls, Capabilities, Needs, Rendered, Stepper
 from mipmap_plugin.backends.linear_light import in_linear_light
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -74,6 +74,12 @@ class CpuBackend:
         from mipmap_plugin.backends.cpu_kernels.stepping import CpuStepper
 
         return CpuStepper(raw, self._refuse, _ranks)
+
+    def compile_ahead(self, gaussians: Gaussians, effects: Sequence[Effects], calls: Calls) -> None:
+        """Start to compile the backward pass in another process, where that pays; the rest is compiled at its first call."""
+        if calls.gradients and not missing():
+            for each in effects:
+                _ahead().start(gaussians.covariances is not None, each, merging=calls.merging)
 
     def _drawn(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
         prepared = [self._prepared(gaussians, camera, effects) for camera, effects in shots]

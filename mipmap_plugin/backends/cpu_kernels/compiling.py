@@ -8,9 +8,10 @@ from hashlib import sha256
 from pathlib import Path
 
 import numba
-from numba.core import compiler, types
+from numba.core import compiler, typed_passes, types, untyped_passes
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler_machinery import PassManager
 from numba.core.registry import CPUDispatcher
 from numba.core.runtime import rtsys
 
@@ -23,6 +24,22 @@ INNER = {"error_model": "numpy", "forceinline": True, "no_cpython_wrapper": True
 KNOWN = (0, 68)
 IS_KNOWN = tuple(map(int, numba.__version__.split(".")[:2])) <= KNOWN
 
+# numba's passes without those for what kernels never use, closures, raised exceptions and whole-array expressions among them.
+PASSES = (
+    untyped_passes.TranslateByteCode,
+    untyped_passes.FixupArgs,
+    untyped_passes.IRProcessing,
+    untyped_passes.GenericRewrites,
+    untyped_passes.DeadBranchPrune,
+    untyped_passes.ReconstructSSA,
+    typed_passes.NopythonTypeInference,
+    typed_passes.PreLowerStripPhis,
+    typed_passes.IRLegalization,
+    typed_passes.AnnotateTypes,
+    typed_passes.NativeLowering,
+    typed_passes.NoPythonBackend,
+)
+
 # The folders and files whose constants and functions are compiled into kernels.
 ROOT = Path(__file__).parents[2]
 SOURCES = ("backends/cpu_kernels/*.py", "splatting/*.py", "effects.py", "render_settings.py")
@@ -32,7 +49,7 @@ def kernel(function):
     """For functions that Python calls: cached on disk, and without the GIL. Division by zero gives infinity, as in numpy; C calls none of them."""
     if not IS_KNOWN:
         return numba.njit(function, cache=True, **KERNEL)
-    dispatcher = _Kernel(function, targetoptions={"nopython": True, **KERNEL})
+    dispatcher = _Kernel(function, targetoptions={"nopython": True, **KERNEL}, pipeline_class=_Compiler)
     dispatcher.enable_caching()
     return dispatcher
 
@@ -41,7 +58,7 @@ def inner(function):
     """For functions that only kernels call, always inlined. Without a Python wrapper they compile faster; a call from Python crashes."""
     if not IS_KNOWN:
         return numba.njit(function, **INNER)
-    return _Inner(function, targetoptions={"nopython": True, **INNER}, pipeline_class=_Compiler)
+    return _Inner(function, targetoptions={"nopython": True, **INNER}, pipeline_class=_InnerCompiler)
 
 
 class _Kernel(CPUDispatcher):
@@ -84,7 +101,16 @@ class _Inner(CPUDispatcher):
         return super().get_call_template(tuple(map(types.unliteral, args)), kws)
 
 
-class _Compiler(compiler.Compiler):
+class _Compiler(compiler.CompilerBase):
+    def define_pipelines(self):
+        passes = PassManager("kernel")
+        for each in PASSES:
+            passes.add_pass(each, each.__name__)
+        passes.finalize()
+        return [passes]
+
+
+class _InnerCompiler(_Compiler):
     def compile_extra(self, function):
         self.state.library = _Library(self.state.targetctx.codegen(), function.__qualname__)
         return super().compile_extra(function)
@@ -92,6 +118,9 @@ class _Compiler(compiler.Compiler):
 
 class _Library(JITCodeLibrary):
     """LLVM code for callers to inline, which is optimized there. numba would optimize it here too, and make machine code that nobody calls."""
+
+    def _optimize_functions(self, module):
+        pass
 
     def _optimize_final_module(self):
         pass

@@ -71,10 +71,11 @@ class _Room:
 
 
 def compile_step() -> None:
-    """Compile the step, of no splat."""
+    """Compile the step, and the activation before the first one, of no splat."""
     rows = SplatArrays(*(np.empty((0, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (1, 3), (3, 3))))
     rates = SplatArrays(*[np.empty(0, np.float32)] * len(rows))
     adam.step(0, 0, rows, rows, rows, rows, rows, rates, (np.float32(0),) * 5)
+    adam.activate_rows(0, 0, rows, rows)
 
 
 def _arrays(tensors: Mapping[str, Tensor]) -> SplatArrays:
