@@ -129,11 +129,17 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
             source = Path(folder, f"source{ending}")
             shutil.copyfile(path, source)
         plain = Path(folder, "plain.ply")
-        if reason := _run(tool, [source], plain):
+        if reason := _run(tool, [_completed(source, Path(folder)) if kind == "sog" else source], plain):
             raise CheckpointError(f"{path} is {name}, but {TOOL} does not read it ({reason}); export it again")
         _settle_frame(tool, source, plain)
         _settle_mode(_mode(source, kind), plain)
         yield plain
+
+
+def _completed(source: Path, folder: Path) -> Path:
+    from mipmap_plugin.formats.sog import completed  # and NumPy, without which options are read
+
+    return completed(source, folder)
 
 
 def _damage(path: Path) -> str:
