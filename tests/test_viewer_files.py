@@ -6,6 +6,7 @@ from unittest.mock import Mock
 
 import anchor_checkpoints
 import moving
+import numpy as np
 import pytest
 import tiny
 import torch
@@ -188,7 +189,18 @@ def test_a_file_has_the_sh_bands_that_the_loader_of_its_viewer_reads(tmp_path, v
 def test_bands_that_the_loader_of_a_viewer_does_not_read_are_told_of(tmp_path):
     model = wrap_model(tiny.model(40).with_degree(4), cameras=tiny.cameras())
     adapted = model.adapt(1 / 4, viewer="spark", recipe="instant")
-    lost = "SH bands above degree 3 are left out, which spark does not read"
+    lost = "SH bands above degree 3 are left out, which not all loaders of spark read"
     with pytest.warns(UserWarning, match=lost):
         file = adapted.save(tmp_path / "a.ply")
     assert lost in adapted.report_of(file).notes and lost not in adapted.report_of(tmp_path / "a.spz").notes
+
+
+KEPT = {"unity": False, "gsplat-js": False, "inria": False, "portable": False, "spark": True, None: True}
+
+
+@pytest.mark.parametrize(("viewer", "kept"), KEPT.items())
+def test_columns_that_the_loader_of_a_viewer_takes_for_others_are_left_out(tmp_path, viewer, kept):
+    """Some take columns by their places, and some count all with 4 bytes, or none but floats."""
+    model = tiny.model(5).with_extras({"segment": np.arange(5, dtype=np.int16)})
+    columns = read_ply(for_loader_of(viewer, model, tmp_path / "a.ply").save(tmp_path / "a.ply", provenance={})).columns
+    assert ("segment" in columns) == kept and len(columns) == 17 + (45 if viewer in ("unity", "portable") else 9) + kept

@@ -28,7 +28,7 @@ GRUT_NORMAL = (0, 0, 1)  # that nv-tlabs/3dgrut writes for every splat, and scie
 DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 QUATERNION = ("rot_0", "rot_1", "rot_2", "rot_3")
-RGB = ("red", "green", "blue")
+RGB, ALPHA = ("red", "green", "blue"), "alpha"
 FILTER_3D = "filter_3D"  # of Mip-Splatting and its successors (`models.mip`)
 
 
@@ -82,10 +82,13 @@ def extra_columns(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def extra_names(columns: Mapping[str, np.ndarray]) -> list[str]:
-    """Which of these columns 3DGS does not define, such as a confidence or a segment id; also normals that are not 0, as those of 3DGS are."""
+    """Which of these columns 3DGS does not define, such as a confidence or a segment id; also normals that are not 0, as those of 3DGS are.
+
+    Not a second set of colors: they would no longer be those of the splats, and some viewers prefer them (`second_colors`).
+    """
     known = {*POSITION, *DC, "opacity", *SCALE, *QUATERNION, *rest_names(columns)}
     known |= set() if any(columns[name].any() for name in NORMAL if name in columns) else set(NORMAL)
-    known |= set() if DC[0] in columns else set(RGB)
+    known |= {*RGB, ALPHA} if all(name in columns for name in RGB) else set()
     return [name for name in columns if name not in known]
 
 
@@ -97,6 +100,13 @@ def notes_on(extras: Mapping[str, np.ndarray]) -> list[str]:
         kernel = "whose particles are Gaussians only of degree 2, which is not its default"
         notes.append(f"its normals are those that 3DGRUT and MetalSplatter write: if it was trained with 3DGRT, {kernel}, it is drawn otherwise here")
     return notes
+
+
+def second_colors(columns: Iterable[str]) -> list[str]:
+    """A note on colors besides those of the harmonics, as Blender writes them; none without both."""
+    if not {DC[0], *RGB} <= set(columns):
+        return []
+    return ["its columns red, green and blue are left out: it has colors without them, and Spark would show a cloud of points, Brush their colors"]
 
 
 def rest_names(columns: Iterable[str]) -> tuple[str, ...]:

@@ -29,7 +29,7 @@ UNITY = Viewer(
     "classic", DILATION,
     # Along y its limit of the Jacobian is that along x, and both are taken from the axis of view.
     replace(WEBGL, min_alpha=1 / 255, frozen_beyond=FRUSTUM_MARGIN, frozen_by_width=True, max_half_axis=8192.0, picture_step=None),
-    read_degrees=NONE_OR_3,
+    read_degrees=NONE_OR_3, extra_columns=False,
     unlike="a splat ends at a square instead of an ellipse, assets are packed at the quality chosen on import, and the background shines "
     "through in linear light" + UNSEEN,
 )  # fmt: skip
@@ -57,7 +57,7 @@ FURTHER = (
     ),
     Viewer(
         "3dgs.cpp", "3DGS.cpp", "3DGS.cpp f614d66, GSScene.cpp and shaders", "classic", DILATION, near_plane=NEAR_PLANE, read_degrees=(3,),
-        unlike="a splat ends at three standard deviations, rounded up to tiles" + UNSEEN,
+        extra_columns=False, unlike="a splat ends at three standard deviations, rounded up to tiles" + UNSEEN,
     ),
     Viewer(
         "lichtfeld", "LichtFeld Studio",
@@ -67,7 +67,7 @@ FURTHER = (
             min_alpha=LICHTFELD_ALPHA, max_alpha=0.999, radius=(-2 * math.log(LICHTFELD_ALPHA)) ** 0.5, max_half_axis=512.5, max_color=4.0, frame=1.4,
         ),
         near_plane=0.01,
-        read_degrees=UP_TO_3,
+        read_degrees=UP_TO_3, extra_columns=False,
         unlike="with its mip filter it is Mip-Splatting's; fainter splats may be up to a quarter longer; October 2025 (0ff1dc2) it drew as Brush does"
         + UNSEEN,
     ),
@@ -96,18 +96,18 @@ FURTHER = (
         "godot-gaussian-splatting 2.1.0 (43a8b43) and 2Retr0/GodotGaussianSplatting 181ef73, gsplat_projection and gsplat_render",
         "classic", DILATION,
         RenderSettings(min_alpha=1e-3, max_alpha=0.999, min_transmittance=1 / 255, frame=1.2, min_variance=GODOT_LEAST),
-        read_degrees=(3,),  # GDGS reads degree 0, too
+        read_degrees=(3,), extra_columns=False,  # GDGS reads degree 0, and such columns, too
         unlike="the picture is shrunk by a pixel, so that it is half a pixel off at its edges; depths have 16 bits; the background shines through in "
         "linear light" + UNSEEN,
     ),
     Viewer(
         "web-splat", "web-splat (KeKsBoTer)", "web-splat 959a3ec, preprocess.wgsl, gaussian.wgsl, renderer.rs", "classic", DILATION, WEB_SPLAT,
-        read_degrees=UP_TO_3,
+        read_degrees=UP_TO_3, extra_columns=False,
         unlike=f"{HALF}; a file whose header says mip=true is drawn with compensation, and kernel_size= is its dilation" + UNSEEN,
     ),
     Viewer(
         "visionary", "Visionary", "visionary-core 1.0.1 (c5d7070), preprocess.wgsl, gaussian.wgsl, point_cloud.ts", "classic", 0.1, WEB_SPLAT,
-        read_degrees=NONE_OR_3,
+        read_degrees=NONE_OR_3, extra_columns=False,
         unlike=f"splats of an opacity below 0.02 are left out; {HALF}, and so are means" + UNSEEN,
     ),
     Viewer(

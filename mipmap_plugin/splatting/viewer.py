@@ -27,6 +27,7 @@ class Viewer:
         sh_degree: Bands above it are not drawn.
         filter_3d: Whether the viewer reads the column filter_3D of a PLY and smooths splats by it.
         read_degrees: SH degrees of PLYs that its loader reads right. A file for it has one of these: with bands of zeros, or without those above.
+        extra_columns: Whether its loader reads a PLY that has more columns than 3DGS defines, of any type.
         unlike: Known differences between the viewer and this record.
     """
 
@@ -40,6 +41,7 @@ class Viewer:
     sh_degree: int = 3
     filter_3d: bool = False
     read_degrees: tuple[int, ...] = (0, 1, 2, 3, 4)
+    extra_columns: bool = True
     unlike: str = ""
 
     def __post_init__(self) -> None:

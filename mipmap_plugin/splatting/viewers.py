@@ -55,11 +55,11 @@ FRONT_TO_BACK = "covariances are stored in float16, quaternions in 8 bits, and t
 BUILT_IN = (
     Viewer(
         "classic", "3DGS: INRIA's viewer", "diff-gaussian-rasterization",
-        "classic", DILATION, near_plane=NEAR_PLANE, unlike=INRIA_UNLIKE,
+        "classic", DILATION, near_plane=NEAR_PLANE, extra_columns=False, unlike=INRIA_UNLIKE,
     ),
     Viewer(
         "antialiased", "3DGS with compensation: INRIA --antialiasing", "diff-gaussian-rasterization, dr_aa",
-        "antialiased", DILATION, near_plane=NEAR_PLANE, unlike=INRIA_UNLIKE,
+        "antialiased", DILATION, near_plane=NEAR_PLANE, extra_columns=False, unlike=INRIA_UNLIKE,
     ),
     Viewer(
         "mip", "Mip-Splatting", "diff-gaussian-rasterization of Mip-Splatting", "mip", 0.1, near_plane=NEAR_PLANE, filter_3d=True,
@@ -101,7 +101,8 @@ BUILT_IN = (
     ),
     Viewer(
         "gsplat-js", "gsplat.js", "gsplat 1.2.9, RenderProgram, PLYLoader, sort.cpp", "classic", DILATION / 4,
-        replace(WEBGL, frame=1.2, max_half_axis=1024.0, packing=EIGHT_BITS, even_buckets=FRONT_FIRST), sh_degree=0, unlike=FRONT_TO_BACK,
+        replace(WEBGL, frame=1.2, max_half_axis=1024.0, packing=EIGHT_BITS, even_buckets=FRONT_FIRST), sh_degree=0, extra_columns=False,
+        unlike=FRONT_TO_BACK,
     ),
     Viewer(
         "three", "three.js, GaussianSplat", "three 0.187.0, examples/jsm/objects/GaussianSplat", "mip", DILATION,
@@ -211,6 +212,11 @@ def degree_for(viewer: str | None, degree: int) -> int:
     """
     read = set.intersection(*(set(find_viewer(name).read_degrees) for name in viewers_for(viewer))) if viewer else {degree}
     return min((each for each in read if each >= degree), default=max(read, default=degree))
+
+
+def reads_extra_columns(viewer: str | None) -> bool:
+    """Whether the loader of the viewer, or of each of a group, reads a PLY with further columns. Raises what `viewers_for` does."""
+    return viewer is None or all(find_viewer(name).extra_columns for name in viewers_for(viewer))
 
 
 def find_viewer(name: str) -> Viewer:
