@@ -38,7 +38,7 @@ def to_parameters(columns: Mapping[str, np.ndarray], path: Path) -> dict[str, Te
     means [N, 3], scales [N, 3] log, quats [N, 4] wxyz, opacities [N] logit, sh0 [N, 1, 3], shN [N, K, 3] basis-major.
     Raises CheckpointError for missing columns and for a number of f_rest columns that fits no SH degree.
     """
-    columns = _with_logits(_with_dc(columns))
+    columns = _with_logits(_with_dc(_with_halves(columns)))
     missing = [name for name in (*POSITION, *DC, "opacity", *SCALE, *QUATERNION) if name not in columns]
     if missing:
         raise CheckpointError(f"{path} is no 3DGS checkpoint: it lacks the columns {', '.join(missing)}; export it again with them")
@@ -120,6 +120,20 @@ def numbered(columns: Iterable[str], prefix: str) -> tuple[str, ...]:
     return tuple(sorted(names, key=lambda name: int(name.removeprefix(prefix))))
 
 
+def holds_halves(columns: Mapping[str, np.ndarray]) -> bool:
+    """Whether these are half-precision floats, which PLY has no name for, so that exporters write ushort: log scales are no whole numbers."""
+    sizes = [columns[name].dtype for name in (*SCALE, *QUATERNION) if name in columns]
+    return bool(sizes) and all(dtype.kind == "u" and dtype.itemsize == 2 for dtype in sizes)
+
+
+def _with_halves(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+    if not holds_halves(columns):
+        return columns
+    known = {*POSITION, *DC, "opacity", *SCALE, *QUATERNION, *rest_names(columns)}
+    halves = {name for name, column in columns.items() if name in known and column.dtype.str[1:] == "u2"}
+    return {name: column.view(f"{column.dtype.str[0]}f2") if name in halves else column for name, column in columns.items()}
+
+
 def _with_dc(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
     """The columns with f_dc computed from red, green and blue if it is missing: integers of full range, or floats in 0..1."""
     if DC[0] in columns or not all(name in columns for name in RGB):
@@ -137,7 +151,8 @@ def _with_logits(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
 
 def whole_opacities(columns: Mapping[str, np.ndarray]) -> str:
     """The type of opacities that are whole numbers; "" if they are floats, or missing."""
-    return columns["opacity"].dtype.name if "opacity" in columns and columns["opacity"].dtype.kind in "iu" else ""
+    whole = "opacity" in columns and columns["opacity"].dtype.kind in "iu" and not holds_halves(columns)
+    return columns["opacity"].dtype.name if whole else ""
 
 
 def _unit(column: np.ndarray) -> np.ndarray:
