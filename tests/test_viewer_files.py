@@ -66,6 +66,12 @@ def test_a_viewer_that_differs_in_its_near_plane_alone_changes_nothing_where_no_
     assert ("as it is" in file.report.returned) == (scale == 1)
 
 
+def test_gsplat_draws_the_bands_of_degree_4_that_it_trained():
+    model = wrap_model(tiny.model(40, TrainedScale(near_plane=0.01), degree=4), cameras=tiny.cameras())
+    assert model.effects().sh_degree == 4 and model.target("gsplat") == model.effects()
+    assert (model.effects(viewer="babylon").sh_degree, model.effects(viewer="classic").sh_degree) == (4, 3)
+
+
 @pytest.mark.parametrize(("near", "viewer"), OTHER_NEAR.items())
 def test_it_is_another_renderer_where_a_view_shows_a_splat_between_both_near_planes(near, viewer):
     views, trained = tiny.cameras(), TrainedScale(near_plane=near)

@@ -48,11 +48,11 @@ LICHTFELD_ALPHA = 0.5 / 255
 # of 0.075: the worst viewer of lego at x1/4 would have 3.3 dB less, the mean 2.7 (docs/viewers.md).
 FURTHER = (
     Viewer(
-        "gsplat", "gsplat, nerfstudio", GSPLAT, "classic", DILATION, near_plane=0.01,
+        "gsplat", "gsplat, nerfstudio", GSPLAT, "classic", DILATION, near_plane=0.01, sh_degree=4,
         unlike="a splat ends at 3.33 standard deviations; until gsplat 1.5 its largest alpha was 0.999",
     ),
     Viewer(
-        "gsplat-antialiased", "gsplat, nerfstudio, their mode antialiased", GSPLAT, "antialiased", DILATION, near_plane=0.01,
+        "gsplat-antialiased", "gsplat, nerfstudio, their mode antialiased", GSPLAT, "antialiased", DILATION, near_plane=0.01, sh_degree=4,
         unlike="as gsplat; until gsplat 1.5 its compensation had no lower bound",
     ),
     Viewer(

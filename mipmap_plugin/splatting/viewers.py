@@ -143,6 +143,7 @@ BUILT_IN = (
         # Colors are limited by the frame buffer, which they reach before they are multiplied by alpha.
         "babylon", "Babylon.js", "@babylonjs/core 9.35.0, gaussianSplatting shaders, GaussianSplattingMaterial", "classic", DILATION / 4,
         replace(WEBGL, even_buckets=EvenBuckets(), frame=1.2, max_half_axis=1024.0, max_color=1.0, packing=EIGHT_BITS),
+        sh_degree=4,
         unlike="covariances are stored in float16, quaternions and SH coefficients in 8 bits; an SPZ file that says it was trained with "
         "antialiasing is drawn with compensation",
     ),
