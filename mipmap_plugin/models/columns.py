@@ -19,6 +19,12 @@ SH_DEGREES = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
 # Opacities keep this distance from 0 and 1, whose logits are infinite: far below one step of 8 bits, yet resolved by float32.
 OPACITY_MARGIN = 1e-6
 
+# Floats above this are no colors in 0..1, even of lights.
+BRIGHTEST = 16
+
+# Floats above this are no colors in 0..1, not even of lights.
+BRIGHTEST = 16
+
 # Rows that are transposed together: 1 to 2 MB of a file, which stay in the cache while columns are copied.
 CHUNK = 8192
 
@@ -135,10 +141,13 @@ def _with_halves(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
 
 
 def _with_dc(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
-    """The columns with f_dc computed from red, green and blue if it is missing: integers of full range, or floats in 0..1."""
+    """The columns with f_dc computed from red, green and blue if it is missing: integers of full range, or floats in 0..1, or in 0..255, as
+    MetalSplatter knows them of nerfstudio's older files."""
     if DC[0] in columns or not all(name in columns for name in RGB):
         return columns
-    return {**columns, **{dc: (_unit(columns[name]) - 0.5) / C0 for dc, name in zip(DC, RGB, strict=True)}}
+    colors = {dc: _unit(columns[name]) for dc, name in zip(DC, RGB, strict=True)}
+    full = 255 if any((column > BRIGHTEST).any() for column in colors.values()) else 1
+    return {**columns, **{dc: (column / full - 0.5) / C0 for dc, column in colors.items()}}
 
 
 def _with_logits(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:

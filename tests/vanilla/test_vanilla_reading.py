@@ -80,7 +80,7 @@ def test_columns_of_16_bits_are_halves(tmp_path, form):
         torch.testing.assert_close(model.parameters()[name], tensor.half().float(), rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("full", [np.uint8(255), np.float32(1)])
+@pytest.mark.parametrize("full", [np.uint8(255), np.float32(1), np.float32(255)])
 def test_rgb_stands_in_for_dc(tmp_path, full):
     columns = {name: column for name, column in splat_columns(2, 0).items() if not name.startswith("f_dc")}
     colors = {name: np.array([full, 0 * full], full.dtype) for name in ("red", "green", "blue")}
