@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from mipmap_plugin.errors import SettingsError
@@ -46,14 +46,23 @@ UNREAD: dict[str, dict[str, str]] = {
     },
 }  # fmt: skip
 
+# The same of viewers in whose name more than one program is, of which some do.
+PARTLY = {
+    ".spz": dict.fromkeys(
+        ("playcanvas", "playcanvas-aa", "playcanvas-webgpu"), "PlayCanvas's engine and supersplat-viewer read no .spz, SuperSplat's editor does"
+    )
+}
+
 
 def refuse_unread(path: Path, viewers: Sequence[str]) -> None:
     """Raise SettingsError for an output that none of the viewers it is made for reads; warn of one that only some of them read."""
-    unread = next((told for ending, told in UNREAD.items() if path.name.lower().endswith(ending)), {})
-    reasons = {viewer: unread[viewer] for viewer in viewers if viewer in unread}
-    if not reasons:
-        return
-    advice = f"{path}: {'; '.join(dict.fromkeys(reasons.values()))}; give a .ply by --output"
-    if len(reasons) == len(viewers):
-        raise SettingsError(advice)
-    warnings.warn(f"{advice} if it is for these too", stacklevel=3)
+    unread, partly = ({viewer: told[viewer] for viewer in viewers if viewer in told} for told in (_told(path, UNREAD), _told(path, PARTLY)))
+    if reasons := "; ".join(dict.fromkeys([*unread.values(), *partly.values()])):
+        advice = f"{path}: {reasons}; give a .ply by --output"
+        if len(unread) == len(viewers):
+            raise SettingsError(advice)
+        warnings.warn(f"{advice} if it is for these too", stacklevel=3)
+
+
+def _told(path: Path, by_ending: Mapping[str, dict[str, str]]) -> dict[str, str]:
+    return next((told for ending, told in by_ending.items() if path.name.lower().endswith(ending)), {})

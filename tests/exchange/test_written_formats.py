@@ -60,6 +60,8 @@ def test_spz_for_several_viewers_is_written_with_a_warning_of_those_that_do_not_
     assert not recwarn.list
     with pytest.warns(UserWarning, match=r"GaussianSplats3D .*; antimatter15/splat, .* read no .spz; give a .ply by --output if it is for these too"):
         refuse_unread(tmp_path / "a.spz", ["spark", "gaussian-splats-3d", "antimatter15"])
+    with pytest.warns(UserWarning, match=r"PlayCanvas's engine .* read no \.spz, SuperSplat's editor does; give a \.ply by --output if"):
+        refuse_unread(tmp_path / "a.spz", ["playcanvas"])
 
 
 @pytest.mark.parametrize(
