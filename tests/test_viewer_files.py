@@ -195,7 +195,7 @@ def test_a_file_has_the_sh_bands_that_the_loader_of_its_viewer_reads(tmp_path, v
 def test_bands_that_the_loader_of_a_viewer_does_not_read_are_told_of(tmp_path):
     model = wrap_model(tiny.model(40).with_degree(4), cameras=tiny.cameras())
     adapted = model.adapt(1 / 4, viewer="spark", recipe="instant")
-    lost = "SH bands above degree 3 are left out, which not all loaders of spark read"
+    lost = "SH bands above degree 3 are left out, which loaders of spark do not read right"
     with pytest.warns(UserWarning, match=lost):
         file = adapted.save(tmp_path / "a.ply")
     assert lost in adapted.report_of(file).notes and lost not in adapted.report_of(tmp_path / "a.spz").notes

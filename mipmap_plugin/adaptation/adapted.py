@@ -147,7 +147,7 @@ class Adapted:
         read = degree_for(viewer, degree)
         lost = [f"SH bands above degree {read}"] if read < degree else []
         lost += [f"the extra columns {extras}"] if extras and not reads_extra_columns(viewer) else []
-        return f"{' and '.join(lost)} are left out, which not all loaders of {viewer} read" if lost else ""
+        return f"{' and '.join(lost)} are left out, which loaders of {viewer} do not read right" if lost else ""
 
     def _rounded(self, path: Path) -> str:
         """What the rounding of its format costs the file at `path`, in a sentence; "" where that is hardly anything, or was not measured."""
