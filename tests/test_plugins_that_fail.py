@@ -358,7 +358,11 @@ def test_buckets_out_of_range_are_refused(wrong):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"near_plane": float("nan")}, {"near_plane": "0.2"}, {"near_plane": -5}, {"sh_degree": -1}, {"eps2d": True}, {"eps2d": 1e300}]
+    "wrong",
+    [
+        *({"near_plane": float("nan")}, {"near_plane": "0.2"}, {"near_plane": -5}, {"sh_degree": -1}, {"eps2d": True}, {"eps2d": 1e300}),
+        *({"read_degrees": ()}, {"read_degrees": 3}, {"read_degrees": (0, [1])}, {"read_degrees": (5,)}),
+    ],
 )
 def test_viewers_out_of_range_are_refused(wrong):
     values = {"eps2d": 0.3, **wrong}

@@ -6,6 +6,7 @@ from unittest.mock import Mock
 
 import anchor_checkpoints
 import moving
+import numpy as np
 import pytest
 import tiny
 import torch
@@ -17,6 +18,7 @@ from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.mip import for_loader_of
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained, flattened
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.process.garbage import uncollected
@@ -62,6 +64,12 @@ def test_a_viewer_that_differs_in_its_near_plane_alone_changes_nothing_where_no_
     assert (file.report.viewer, file.report.returned) == (viewer, plain.report.returned)
     assert all(torch.equal(tensor, plain.model.parameters()[name]) for name, tensor in file.model.parameters().items())
     assert ("as it is" in file.report.returned) == (scale == 1)
+
+
+def test_gsplat_draws_the_bands_of_degree_4_that_it_trained():
+    model = wrap_model(tiny.model(40, TrainedScale(near_plane=0.01), degree=4), cameras=tiny.cameras())
+    assert model.effects().sh_degree == 4 and model.target("gsplat") == model.effects()
+    assert (model.effects(viewer="babylon").sh_degree, model.effects(viewer="classic").sh_degree) == (4, 3)
 
 
 @pytest.mark.parametrize(("near", "viewer"), OTHER_NEAR.items())
@@ -162,3 +170,43 @@ def test_the_command_says_whom_a_file_without_a_viewer_is_for(tmp_path, capsys):
 def test_a_file_of_a_base_that_gsplat_trained_is_for_inria_s_viewer_too_if_nothing_is_near():
     said = _made_for(Mock(viewer=None), tiny.model(3, TrainedScale(near_plane=0.01)))
     assert "3DGS does (gsplat, nerfstudio, and INRIA where no splat is nearer than 0.2 units)" in said
+
+
+# By its source, the SH degree of the file for each loader: that of the splats, unless it reads only others right.
+WRITTEN_DEGREES = {
+    "unity": (0, 3, 3, 3, 3), "gdgs": (3, 3, 3, 3, 3), "3dgs.cpp": (3, 3, 3, 3, 3), "kiri": (1, 1, 2, 3, 3), "spark": (0, 1, 2, 3, 3),
+    "supersplat": (0, 1, 2, 3, 3), "portable": (0, 3, 3, 3, 3), "brush": (0, 1, 2, 3, 4), "classic": (0, 1, 2, 3, 4), None: (0, 1, 2, 3, 4),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("viewer", WRITTEN_DEGREES)
+@pytest.mark.parametrize("degree", range(5))
+def test_a_file_has_the_sh_bands_that_the_loader_of_its_viewer_reads(tmp_path, viewer, degree):
+    model, each = tiny.model(5).with_degree(degree), (degree + 1) ** 2 - 1
+    columns = read_ply(for_loader_of(viewer, model, tmp_path / "a.ply").save(tmp_path / "a.ply", provenance={})).columns
+    count = sum(name.startswith("f_rest_") for name in columns) // 3
+    assert count == (WRITTEN_DEGREES[viewer][degree] + 1) ** 2 - 1
+    rest = torch.zeros(5, max(count, each), 3)
+    rest[:, :each] = model.parameters()["shN"]
+    written = [columns[f"f_rest_{channel * count + number}"].tolist() for number in range(count) for channel in range(3)]
+    assert written == rest[:, :count].flatten(1).T.tolist()
+
+
+def test_bands_that_the_loader_of_a_viewer_does_not_read_are_told_of(tmp_path):
+    model = wrap_model(tiny.model(40).with_degree(4), cameras=tiny.cameras())
+    adapted = model.adapt(1 / 4, viewer="spark", recipe="instant")
+    lost = "SH bands above degree 3 are left out, which loaders of spark do not read right"
+    with pytest.warns(UserWarning, match=lost):
+        file = adapted.save(tmp_path / "a.ply")
+    assert lost in adapted.report_of(file).notes and lost not in adapted.report_of(tmp_path / "a.spz").notes
+
+
+KEPT = {"unity": False, "gsplat-js": False, "inria": False, "portable": False, "spark": True, None: True}
+
+
+@pytest.mark.parametrize(("viewer", "kept"), KEPT.items())
+def test_columns_that_the_loader_of_a_viewer_takes_for_others_are_left_out(tmp_path, viewer, kept):
+    """Some take columns by their places, and some count all with 4 bytes, or none but floats."""
+    model = tiny.model(5).with_extras({"segment": np.arange(5, dtype=np.int16)})
+    columns = read_ply(for_loader_of(viewer, model, tmp_path / "a.ply").save(tmp_path / "a.ply", provenance={})).columns
+    assert ("segment" in columns) == kept and len(columns) == 17 + (45 if viewer in ("unity", "portable") else 9) + kept

@@ -35,6 +35,7 @@ from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.plugin_errors import naming_any, unchanged
 from mipmap_plugin.process.torch_modes import in_usual_modes, usual_modes
 from mipmap_plugin.progress import announced
+from mipmap_plugin.splatting.viewers import degree_for, reads_extra_columns
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -107,7 +108,7 @@ class Adapted:
             write_json(saved.with_name(saved.name + REPORT), self.report_of(saved).model_dump(), overwrite=overwrite)
         for state in self.states:
             state.remove()
-        for said in filter(None, (self._rounded(saved), self._drawn_otherwise(saved))):
+        for said in filter(None, (self._unread(saved), self._rounded(saved), self._drawn_otherwise(saved))):
             warn(said)
         return saved
 
@@ -132,11 +133,21 @@ class Adapted:
     def report_of(self, path: Path) -> Report:
         """The report of the file at `path`, which also says what its format rounds, what it has no place for, and who draws it otherwise."""
         left_out = without_place(path, getattr(self.model, "extras", ()), getattr(self.model, "sh_degree", 0))
-        lost = filter(None, (left_out, self._rounded(path), self._drawn_otherwise(path)))
+        lost = filter(None, (left_out, self._unread(path), self._rounded(path), self._drawn_otherwise(path)))
         moved = self.model.traits.placed and (path.suffix.lower() == ".ply" or is_written(path))  # which does not say where the cameras go
         cameras_from = {} if moved else self.report.cameras_from
         changes = {"notes": [*self.report.notes, *lost], "cameras_from": cameras_from, "written": None}
         return self.report.model_copy(update=changes | self.written.get(path, {}))
+
+    def _unread(self, path: Path) -> str:
+        """What the PLY at `path` is without, for the loader of its viewer does not read it, in a sentence; "" if it has everything."""
+        if is_written(path):
+            return ""
+        viewer, degree, extras = self.report.viewer, getattr(self.model, "sh_degree", 0), ", ".join(getattr(self.model, "extras", ()))
+        read = degree_for(viewer, degree)
+        lost = [f"SH bands above degree {read}"] if read < degree else []
+        lost += [f"the extra columns {extras}"] if extras and not reads_extra_columns(viewer) else []
+        return f"{' and '.join(lost)} are left out, which loaders of {viewer} do not read right" if lost else ""
 
     def _rounded(self, path: Path) -> str:
         """What the rounding of its format costs the file at `path`, in a sentence; "" where that is hardly anything, or was not measured."""

@@ -1,4 +1,4 @@
-"""Writing SOG, version 2 (PlayCanvas): splats in the pixels of lossless WebP images, in a zip archive.
+"""SOG, version 2 (PlayCanvas): splats in the pixels of lossless WebP images, in a zip archive. It is written, and completed where it lacks a number.
 
 splat-transform writes it as well, but rounds rotations, opacities and places down, looks up spherical harmonics in a table that has as few as half as
 many entries as there are splats, and finds it in minutes; of a capture's file that cost up to 9 dB.
@@ -7,6 +7,7 @@ many entries as there are splats, and finds it in minutes; of a capture's file t
 from __future__ import annotations
 
 import json
+import shutil
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 
 from mipmap_plugin.formats.codebooks import codebook, palette
 from mipmap_plugin.formats.images import lossless_webp
+from mipmap_plugin.formats.tags import DAMAGE, meta_of_sog
 
 # Entries of the table of spherical harmonics: their numbers have 16 bits, and 64 of them lie in a row.
 MOST_ENTRIES, IN_A_ROW = 1 << 16, 64
@@ -72,6 +74,35 @@ def write_sog(path: Path, columns: Mapping[str, np.ndarray], *, antialiased: boo
             entry = zipfile.ZipInfo(name)  # without the time, so that the same splats give the same bytes
             entry.external_attr = READABLE << 16
             archive.writestr(entry, content)
+
+
+def completed(source: Path, folder: Path) -> Path:
+    """A SOG that says how many entries its table of harmonics has: `source`, which is an archive or a meta.json, or a copy of it in `folder`.
+
+    LichtFeld Studio wrote `palette_size` for `count` in 2025. Without that, splat-transform reads harmonics as 0.
+    """
+    try:
+        meta = meta_of_sog(source)
+        table = meta.get("shN")
+        if meta.get("version") != 2 or not table or "count" in table:
+            return source
+        text = json.dumps({**meta, "shN": {**table, "count": table.get("palette_size", MOST_ENTRIES)}})
+        if zipfile.is_zipfile(source):
+            return _with_meta(source, folder / "completed.sog", text)
+        for name in (Path(name).name for part in meta.values() if isinstance(part, dict) for name in part.get("files", ())):
+            shutil.copyfile(source.with_name(name), folder / name)
+        copy = folder / source.name
+        copy.write_text(text)
+        return copy
+    except DAMAGE:
+        return source  # of which splat-transform tells
+
+
+def _with_meta(source: Path, copy: Path, text: str) -> Path:
+    with zipfile.ZipFile(source) as archive, zipfile.ZipFile(copy, "w") as out:
+        for name in archive.namelist():
+            out.writestr(name, text if name.rpartition("/")[2] == "meta.json" else archive.read(name))
+    return copy
 
 
 def _stack(columns: Mapping[str, np.ndarray], name: str, count: int) -> np.ndarray:

@@ -10,7 +10,6 @@ import re
 import shutil
 import subprocess
 import tempfile
-import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -48,27 +47,6 @@ SPZ_VERSION = "3"
 # The highest SH degree that its versions from 3.0 on read and write, though SPZ itself has room for 4.
 MOST_BANDS = 3
 
-# Viewers that do not read it, by their source: for these a PLY has to be written. "classic" and "antialiased" are names for whatever draws as 3DGS
-# does, and some of that reads it.
-NO_SPZ = {
-    "gaussian-splats-3d": "GaussianSplats3D 0.4.7 reads .spz up to version 2, and splat-transform writes 3 at least",
-    **dict.fromkeys(("antimatter15", "aframe", "gsplat-js"), "antimatter15/splat, aframe-gaussian-splatting and gsplat.js read no .spz"),
-    "mip": "Mip-Splatting reads PLYs only, with a column filter_3D that .spz has no place for",
-    "kiri": "KIRI's add-on for Blender reads PLYs only",
-}
-
-# Viewers that read a .glb as it is written here, and names for whatever draws as 3DGS does: three.js by an extension of its loader, Babylon.js by the
-# package of its loaders. And viewers that do not, by their source; of others neither is known.
-READ_GLB = ("playcanvas", "playcanvas-webgpu", "playcanvas-aa", "three", "babylon", "classic", "antialiased")
-NO_GLB = {
-    **{
-        viewer: f"{viewer} reads no splats in glTF"
-        for viewer in ("spark", "gaussian-splats-3d", "gsplat-js", "antimatter15", "aframe", "mip", "brush", "lichtfeld", "web-splat",
-                       "visionary", "metalsplatter", "vk-gaussian-splatting", "splatapult", "gdgs", "3dgs.cpp", "kiri")
-    },
-    "cesium": "Cesium draws no splats in glTF but SPZ, as levels --tiles writes them",
-}  # fmt: skip
-
 # From 2.1 until 3.0, splat-transform turned splats by half a turn about x when it read SPZ and when it wrote it; before and since, it leaves them
 # in the frame in which they are stored.
 TURNS_SPZ = ((2, 1), (3, 0))
@@ -98,18 +76,6 @@ def refuse_exchange(path: Path) -> list[str]:
     if reason := _too_old(tool, oldest):
         raise SettingsError(f"{path}: {reason}; or {'leave Streamed SOG out' if path.name == LOD_META else 'give a .ply'}")
     return tool
-
-
-def refuse_unread(path: Path, viewers: Sequence[str]) -> None:
-    """Raise SettingsError for an output that none of the viewers it is made for reads; warn of one that only some of them read."""
-    unread = NO_GLB if is_glb(path) else NO_SPZ if _is_spz(path) else {}
-    reasons = {viewer: unread[viewer] for viewer in viewers if viewer in unread}
-    if not reasons:
-        return
-    advice = f"{path}: {'; '.join(dict.fromkeys(reasons.values()))}; give a .ply by --output"
-    if len(reasons) == len(viewers):
-        raise SettingsError(advice)
-    warnings.warn(f"{advice} if it is for these too", stacklevel=3)
 
 
 def _too_old(tool: Sequence[str], oldest: Sequence[int]) -> str:
@@ -163,11 +129,17 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
             source = Path(folder, f"source{ending}")
             shutil.copyfile(path, source)
         plain = Path(folder, "plain.ply")
-        if reason := _run(tool, [source], plain):
+        if reason := _run(tool, [_completed(source, Path(folder)) if kind == "sog" else source], plain):
             raise CheckpointError(f"{path} is {name}, but {TOOL} does not read it ({reason}); export it again")
         _settle_frame(tool, source, plain)
         _settle_mode(_mode(source, kind), plain)
         yield plain
+
+
+def _completed(source: Path, folder: Path) -> Path:
+    from mipmap_plugin.formats.sog import completed  # and NumPy, without which options are read
+
+    return completed(source, folder)
 
 
 def _damage(path: Path) -> str:

@@ -43,6 +43,10 @@ _SPZ_FLAGS, _SPZ_ANTIALIASED = 14, 1
 _MOST_OF_META = 1 << 20
 
 
+# What a damaged file makes of the code that reads its header or its meta.json.
+DAMAGE = (OSError, EOFError, ValueError, LookupError, AttributeError, TypeError, RecursionError, zlib.error, zipfile.BadZipFile)
+
+
 def mode_in_exchange(path: Path, kind: str) -> str | None:
     """How an SPZ or SOG (`kind`) says that it is to be drawn, as `render_mode` of a PLY; None if it does not say."""
     try:
@@ -53,9 +57,9 @@ def mode_in_exchange(path: Path, kind: str) -> str | None:
                     file.seek(0)
                     head = gzip.GzipFile(fileobj=file).read(_SPZ_FLAGS + 1)
             return "antialiased" if head.startswith(b"NGSP") and head[_SPZ_FLAGS] & _SPZ_ANTIALIASED else None
-        model = _meta_of_sog(path).get("model") if kind == "sog" else None
+        model = meta_of_sog(path).get("model") if kind == "sog" else None
         return model if model in ("antialiased", "2dgs") else None
-    except (OSError, EOFError, ValueError, LookupError, AttributeError, TypeError, RecursionError, zlib.error, zipfile.BadZipFile):
+    except DAMAGE:
         return None  # damaged, of which whoever reads its splats tells
 
 
@@ -70,7 +74,7 @@ def mark_antialiased(file: Path) -> None:
         file.write_bytes(content.replace(b"element ", b"comment SplatRenderMode: mip\nelement ", 1))
 
 
-def _meta_of_sog(path: Path) -> Any:
+def meta_of_sog(path: Path) -> Any:
     """The content of a SOG's meta.json, which is the file itself or in an archive."""
     if not zipfile.is_zipfile(path):
         return json.loads(path.read_bytes()[:_MOST_OF_META])

@@ -19,6 +19,7 @@ from mipmap_plugin.models import contract
 from mipmap_plugin.models.base import SplatModel, digest_of_model
 from mipmap_plugin.models.mip import for_loader_of, wants_filter
 from mipmap_plugin.recipes import recipe, scale_of_fraction
+from mipmap_plugin.splatting.viewers import degree_for
 
 UNITS = {"": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
 SIZE = re.compile(r"([0-9.]+)\s*([a-z]*)", re.IGNORECASE)
@@ -61,7 +62,8 @@ def recorded(base: FrozenBase, requests: Sequence[tuple[float, str | None]], set
     name, digest = further.pop("recipe"), digest_of_model(base.model)
     made_from = {"base": digest, "inputs": base.asked, "orbit": asdict(base.viewpoints.orbit)}
     records = [provenance({"scale": scale, "viewer": viewer, **made_from}, recipe(name, scale, **further), versions()) for scale, viewer in requests]
-    return max(records, key=lambda record: (wants_filter(record["viewer"]), len(json.dumps(record, default=str))))
+    degree = getattr(base.model, "sh_degree", 0)
+    return max(records, key=lambda of: (degree_for(of["viewer"], degree), wants_filter(of["viewer"]), len(json.dumps(of, default=str))))
 
 
 def splats_within(model: SplatModel, size: int, name: str, record: dict[str, Any]) -> int:

@@ -19,6 +19,12 @@ SH_DEGREES = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
 # Opacities keep this distance from 0 and 1, whose logits are infinite: far below one step of 8 bits, yet resolved by float32.
 OPACITY_MARGIN = 1e-6
 
+# Floats above this are no colors in 0..1, even of lights.
+BRIGHTEST = 16
+
+# Floats above this are no colors in 0..1, not even of lights.
+BRIGHTEST = 16
+
 # Rows that are transposed together: 1 to 2 MB of a file, which stay in the cache while columns are copied.
 CHUNK = 8192
 
@@ -28,7 +34,7 @@ GRUT_NORMAL = (0, 0, 1)  # that nv-tlabs/3dgrut writes for every splat, and scie
 DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 QUATERNION = ("rot_0", "rot_1", "rot_2", "rot_3")
-RGB = ("red", "green", "blue")
+RGB, ALPHA = ("red", "green", "blue"), "alpha"
 FILTER_3D = "filter_3D"  # of Mip-Splatting and its successors (`models.mip`)
 
 
@@ -38,7 +44,7 @@ def to_parameters(columns: Mapping[str, np.ndarray], path: Path) -> dict[str, Te
     means [N, 3], scales [N, 3] log, quats [N, 4] wxyz, opacities [N] logit, sh0 [N, 1, 3], shN [N, K, 3] basis-major.
     Raises CheckpointError for missing columns and for a number of f_rest columns that fits no SH degree.
     """
-    columns = _with_logits(_with_dc(columns))
+    columns = _with_logits(_with_dc(_with_halves(columns)))
     missing = [name for name in (*POSITION, *DC, "opacity", *SCALE, *QUATERNION) if name not in columns]
     if missing:
         raise CheckpointError(f"{path} is no 3DGS checkpoint: it lacks the columns {', '.join(missing)}; export it again with them")
@@ -82,10 +88,13 @@ def extra_columns(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def extra_names(columns: Mapping[str, np.ndarray]) -> list[str]:
-    """Which of these columns 3DGS does not define, such as a confidence or a segment id; also normals that are not 0, as those of 3DGS are."""
+    """Which of these columns 3DGS does not define, such as a confidence or a segment id; also normals that are not 0, as those of 3DGS are.
+
+    Not a second set of colors: they would no longer be those of the splats, and some viewers prefer them (`second_colors`).
+    """
     known = {*POSITION, *DC, "opacity", *SCALE, *QUATERNION, *rest_names(columns)}
     known |= set() if any(columns[name].any() for name in NORMAL if name in columns) else set(NORMAL)
-    known |= set() if DC[0] in columns else set(RGB)
+    known |= {*RGB, ALPHA} if all(name in columns for name in RGB) else set()
     return [name for name in columns if name not in known]
 
 
@@ -99,6 +108,13 @@ def notes_on(extras: Mapping[str, np.ndarray]) -> list[str]:
     return notes
 
 
+def second_colors(columns: Iterable[str]) -> list[str]:
+    """A note on colors besides those of the harmonics, as Blender writes them; none without both."""
+    if not {DC[0], *RGB} <= set(columns):
+        return []
+    return ["its columns red, green and blue are left out: it has colors without them, and Spark would show a cloud of points, Brush their colors"]
+
+
 def rest_names(columns: Iterable[str]) -> tuple[str, ...]:
     """The names of the f_rest columns in the order of their numbers."""
     return numbered(columns, "f_rest_")
@@ -110,11 +126,28 @@ def numbered(columns: Iterable[str], prefix: str) -> tuple[str, ...]:
     return tuple(sorted(names, key=lambda name: int(name.removeprefix(prefix))))
 
 
+def holds_halves(columns: Mapping[str, np.ndarray]) -> bool:
+    """Whether these are half-precision floats, which PLY has no name for, so that exporters write ushort: log scales are no whole numbers."""
+    sizes = [columns[name].dtype for name in (*SCALE, *QUATERNION) if name in columns]
+    return bool(sizes) and all(dtype.kind == "u" and dtype.itemsize == 2 for dtype in sizes)
+
+
+def _with_halves(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+    if not holds_halves(columns):
+        return columns
+    known = {*POSITION, *DC, "opacity", *SCALE, *QUATERNION, *rest_names(columns)}
+    halves = {name for name, column in columns.items() if name in known and column.dtype.str[1:] == "u2"}
+    return {name: column.view(f"{column.dtype.str[0]}f2") if name in halves else column for name, column in columns.items()}
+
+
 def _with_dc(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
-    """The columns with f_dc computed from red, green and blue if it is missing: integers of full range, or floats in 0..1."""
+    """The columns with f_dc computed from red, green and blue if it is missing: integers of full range, or floats in 0..1, or in 0..255, as
+    MetalSplatter knows them of nerfstudio's older files."""
     if DC[0] in columns or not all(name in columns for name in RGB):
         return columns
-    return {**columns, **{dc: (_unit(columns[name]) - 0.5) / C0 for dc, name in zip(DC, RGB, strict=True)}}
+    colors = {dc: _unit(columns[name]) for dc, name in zip(DC, RGB, strict=True)}
+    full = 255 if any((column > BRIGHTEST).any() for column in colors.values()) else 1
+    return {**columns, **{dc: (column / full - 0.5) / C0 for dc, column in colors.items()}}
 
 
 def _with_logits(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
@@ -127,7 +160,8 @@ def _with_logits(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
 
 def whole_opacities(columns: Mapping[str, np.ndarray]) -> str:
     """The type of opacities that are whole numbers; "" if they are floats, or missing."""
-    return columns["opacity"].dtype.name if "opacity" in columns and columns["opacity"].dtype.kind in "iu" else ""
+    whole = "opacity" in columns and columns["opacity"].dtype.kind in "iu" and not holds_halves(columns)
+    return columns["opacity"].dtype.name if whole else ""
 
 
 def _unit(column: np.ndarray) -> np.ndarray:

@@ -28,7 +28,7 @@ from mipmap_plugin.models.health import LARGEST, drop
 from mipmap_plugin.models.outputs import finite
 from mipmap_plugin.models.reading import read_splats
 from mipmap_plugin.models.vanilla import VanillaModel
-from mipmap_plugin.splatting.viewers import find_viewer, viewers_for
+from mipmap_plugin.splatting.viewers import degree_for, find_viewer, reads_extra_columns, viewers_for
 
 # Screen filter of each family, and its dilation in px² if no cfg_args gives the kernel_size.
 FAMILY_FILTERS = {"mip": ("mip", 0.1), "gof": ("mip", 0.0), "analytic": ("analytic", 0.0)}
@@ -171,11 +171,17 @@ def load_mip(path: str | Path, *, iteration: int | None = None) -> MipModel:
 def for_loader_of(viewer: str | None, model: SplatModel, path: Path) -> SplatModel:
     """The model as the viewer that it is made for loads it from `path`.
 
-    Mip-Splatting's loader requires the column filter_3D. It is 0: the splats of a file for a viewer are smoothed as far as they have to be.
+    Mip-Splatting's loader requires the column filter_3D. It is 0: the splats of a file for a viewer are smoothed as far as they have to be. Other
+    loaders read PLYs of some SH degrees only (`Viewer.read_degrees`), or without further columns.
     """
-    if not wants_filter(viewer) or is_written(path) or not isinstance(model, VanillaModel):
+    if is_written(path) or not isinstance(model, VanillaModel):
         return model
-    return model.with_extras({**model.extras, COLUMN: np.zeros(len(model), dtype=np.float32)})
+    degree = degree_for(viewer, model.sh_degree)
+    if degree != model.sh_degree and (path.suffix.lower() == ".ply" or not model.traits.placed):
+        model = model.with_degree(degree)
+    if model.extras and not reads_extra_columns(viewer):
+        model = model.with_extras({})
+    return model.with_extras({**model.extras, COLUMN: np.zeros(len(model), dtype=np.float32)}) if wants_filter(viewer) else model
 
 
 def wants_filter(viewer: str | None) -> bool:

@@ -111,6 +111,11 @@ class VanillaModel:
         """The same splats, sharing tensors, with these columns [N] after those of 3DGS."""
         return self._with(self._parameters, replace(self._origin, extras=extras))
 
+    def with_degree(self: Model, degree: int) -> Model:
+        """The same splats, sharing tensors, with SH bands up to `degree`: of zeros where they have none, and without those above."""
+        held, wanted = self._parameters["shN"].detach(), (degree + 1) ** 2 - 1
+        return self._with(self._parameters | {"shN": torch.nn.functional.pad(held[:, :wanted], (0, 0, 0, max(0, wanted - held.shape[1])))})
+
     def noted(self: Model, note: str) -> Model:
         """The same splats, sharing tensors, with one more note."""
         model = self._with(self._parameters)

@@ -26,6 +26,8 @@ class Viewer:
         near_plane: World units; None: decided by the page that embeds the viewer.
         sh_degree: Bands above it are not drawn.
         filter_3d: Whether the viewer reads the column filter_3D of a PLY and smooths splats by it.
+        read_degrees: SH degrees of PLYs that its loader reads right. A file for it has one of these: with bands of zeros, or without those above.
+        extra_columns: Whether its loader reads a PLY that has more columns than 3DGS defines, of any type.
         unlike: Known differences between the viewer and this record.
     """
 
@@ -38,6 +40,8 @@ class Viewer:
     near_plane: float | None = None
     sh_degree: int = 3
     filter_3d: bool = False
+    read_degrees: tuple[int, ...] = (0, 1, 2, 3, 4)
+    extra_columns: bool = True
     unlike: str = ""
 
     def __post_init__(self) -> None:
@@ -55,6 +59,10 @@ class Viewer:
             effects, sh_degree=degree, screen_filter=self.screen_filter, eps2d=self.eps2d, near_plane=near, settings=self.settings
         )
 
+
+# `Viewer.read_degrees` of loaders that refuse degree 4, or take its columns for those of degree 3; and of those that read all that is neither 0 nor 3
+# as degree 0 or 3, or refuse it.
+UP_TO_3, NONE_OR_3 = (0, 1, 2, 3), (0, 3)
 
 # Standard deviations at which a splat ends in viewers that draw it as a 2 x 2 square with the weight exp(-r²) up to r = 2.
 EDGE = 8**0.5

@@ -20,7 +20,7 @@ from mipmap_plugin.render_settings import EvenBuckets, Packing
 from mipmap_plugin.screen_filters import DILATION
 from mipmap_plugin.splatting.native_viewers import BRUSH, FURTHER, UNITY
 from mipmap_plugin.splatting.viewer import EDGE as EDGE
-from mipmap_plugin.splatting.viewer import WEBGL
+from mipmap_plugin.splatting.viewer import UP_TO_3, WEBGL
 from mipmap_plugin.splatting.viewer import Viewer as Viewer
 
 # px²: PlayCanvas and Cesium require half-axes of 2 half pixels: 2·sqrt(2·4·v) >= 2, v >= 1/8.
@@ -54,12 +54,12 @@ FRONT_TO_BACK = "covariances are stored in float16, quaternions in 8 bits, and t
 
 BUILT_IN = (
     Viewer(
-        "classic", "3DGS: INRIA's viewer", "diff-gaussian-rasterization; 3DGS.cpp f614d66",
-        "classic", DILATION, near_plane=NEAR_PLANE, unlike=INRIA_UNLIKE,
+        "classic", "3DGS: INRIA's viewer", "diff-gaussian-rasterization",
+        "classic", DILATION, near_plane=NEAR_PLANE, extra_columns=False, unlike=INRIA_UNLIKE,
     ),
     Viewer(
         "antialiased", "3DGS with compensation: INRIA --antialiasing", "diff-gaussian-rasterization, dr_aa",
-        "antialiased", DILATION, near_plane=NEAR_PLANE, unlike=INRIA_UNLIKE,
+        "antialiased", DILATION, near_plane=NEAR_PLANE, extra_columns=False, unlike=INRIA_UNLIKE,
     ),
     Viewer(
         "mip", "Mip-Splatting", "diff-gaussian-rasterization of Mip-Splatting", "mip", 0.1, near_plane=NEAR_PLANE, filter_3d=True,
@@ -76,14 +76,15 @@ BUILT_IN = (
                 log_scales=(-12.0, 9.0, 21 / 254), quats="octahedral", half_means=True,
             ),
         ),
+        read_degrees=UP_TO_3,
     ),
-    Viewer("playcanvas", "PlayCanvas and SuperSplat, WebGL", PLAYCANVAS_SOURCE, "classic", DILATION / 4, PLAYCANVAS),
+    Viewer("playcanvas", "PlayCanvas and SuperSplat, WebGL", PLAYCANVAS_SOURCE, "classic", DILATION / 4, PLAYCANVAS, read_degrees=UP_TO_3),
     Viewer(
         "playcanvas-webgpu", "PlayCanvas and SuperSplat, WebGPU", "playcanvas 2.23.3, compute-gsplat-common, gsplat-hybrid-renderer",
-        "classic", DILATION / 4, replace(PLAYCANVAS, bucketed=False, boxed=True, min_contribution=CONTRIBUTION),
+        "classic", DILATION / 4, replace(PLAYCANVAS, bucketed=False, boxed=True, min_contribution=CONTRIBUTION), read_degrees=UP_TO_3,
         unlike="among splats much larger than the image some pixels differ, 43 dB in all",
     ),
-    Viewer("playcanvas-aa", "PlayCanvas and SuperSplat with antiAlias", PLAYCANVAS_SOURCE, "mip", DILATION / 4, PLAYCANVAS),
+    Viewer("playcanvas-aa", "PlayCanvas and SuperSplat with antiAlias", PLAYCANVAS_SOURCE, "mip", DILATION / 4, PLAYCANVAS, read_degrees=UP_TO_3),
     Viewer(
         "gaussian-splats-3d", "GaussianSplats3D", "@mkkellogg/gaussian-splats-3d 0.4.7, SplatMaterial3D",
         "classic", DILATION,
@@ -100,7 +101,8 @@ BUILT_IN = (
     ),
     Viewer(
         "gsplat-js", "gsplat.js", "gsplat 1.2.9, RenderProgram, PLYLoader, sort.cpp", "classic", DILATION / 4,
-        replace(WEBGL, frame=1.2, max_half_axis=1024.0, packing=EIGHT_BITS, even_buckets=FRONT_FIRST), sh_degree=0, unlike=FRONT_TO_BACK,
+        replace(WEBGL, frame=1.2, max_half_axis=1024.0, packing=EIGHT_BITS, even_buckets=FRONT_FIRST), sh_degree=0, extra_columns=False,
+        unlike=FRONT_TO_BACK,
     ),
     Viewer(
         "three", "three.js, GaussianSplat", "three 0.187.0, examples/jsm/objects/GaussianSplat", "mip", DILATION,
@@ -108,6 +110,7 @@ BUILT_IN = (
             WEBGL, radius=2.0, frame=1.4, max_half_axis=2048.0, max_color=1.0, packing=Packing(color=1 / 255, bands=(1 / 128,) * 3),
             even_buckets=EvenBuckets(4095, sphere_from=0.1, later_in_front=True),
         ),
+        read_degrees=UP_TO_3,
         unlike="buckets of depth are those of a camera whose near plane is at 0.1, three.js's default; colors are the file's if the renderer's "
         "outputColorSpace is linear",
     ),
@@ -140,6 +143,7 @@ BUILT_IN = (
         # Colors are limited by the frame buffer, which they reach before they are multiplied by alpha.
         "babylon", "Babylon.js", "@babylonjs/core 9.35.0, gaussianSplatting shaders, GaussianSplattingMaterial", "classic", DILATION / 4,
         replace(WEBGL, even_buckets=EvenBuckets(), frame=1.2, max_half_axis=1024.0, max_color=1.0, packing=EIGHT_BITS),
+        sh_degree=4,
         unlike="covariances are stored in float16, quaternions and SH coefficients in 8 bits; an SPZ file that says it was trained with "
         "antialiasing is drawn with compensation",
     ),
@@ -150,7 +154,7 @@ BUILT_IN = (
 IN_FILES = re.compile(r"\w[\w.+-]*")
 
 ALIASES = {
-    **dict.fromkeys(("inria", "3dgs.cpp"), "classic"),
+    "inria": "classic",
     **dict.fromkeys(("supersplat", "supersplat-viewer"), "playcanvas"),
     **{"mkkellogg": "gaussian-splats-3d", "threejs": "three", "drei": "aframe", "godot": "gdgs"},
     **{"nerfstudio": "gsplat", "nerfstudio-antialiased": "gsplat-antialiased"},
@@ -200,6 +204,20 @@ def viewers_for(name: str) -> tuple[str, ...]:
     if not viewer or not all(isinstance(member, str) for member in viewer):
         raise PluginError(f"viewer group {name!r} must contain names of registered viewers, got {viewer!r}")
     return viewer
+
+
+def degree_for(viewer: str | None, degree: int) -> int:
+    """The SH degree of a PLY that the viewer, or each of a group, reads right and draws as one of this `degree`; the highest where there is none.
+
+    Raises what `viewers_for` does.
+    """
+    read = set.intersection(*(set(find_viewer(name).read_degrees) for name in viewers_for(viewer))) if viewer else {degree}
+    return min((each for each in read if each >= degree), default=max(read, default=degree))
+
+
+def reads_extra_columns(viewer: str | None) -> bool:
+    """Whether the loader of the viewer, or of each of a group, reads a PLY with further columns. Raises what `viewers_for` does."""
+    return viewer is None or all(find_viewer(name).extra_columns for name in viewers_for(viewer))
 
 
 def find_viewer(name: str) -> Viewer:

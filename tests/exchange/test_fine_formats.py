@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from exchange_files import tool_request
 from PIL import Image
 
 from mipmap_plugin.formats.codebooks import codebook, palette
-from mipmap_plugin.formats.sog import write_sog
+from mipmap_plugin.formats.sog import completed, write_sog
 from mipmap_plugin.formats.spz import refine_harmonics
+from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
 
@@ -94,6 +96,30 @@ def test_few_splats_and_equal_ones_are_kept_as_they_are(tmp_path, count):
     kept = [name for name in columns if name in found]
     assert all(np.allclose(found[name], columns[name], atol=1e-6) for name in kept) and len(kept) == 3 + 3 + 3 + 45
     assert np.allclose(found["quats"], [[1, 0, 0, 0]], atol=0.01)
+
+
+@pytest.mark.parametrize("packed", [True, False])
+@pytest.mark.parametrize("told", [{"palette_size": 40}, {}])
+def test_a_table_that_does_not_say_how_many_entries_it_has_is_told_of(tmp_path, tool, packed, told):
+    """As LichtFeld Studio of 2025 wrote it; splat-transform, which then reads harmonics as 0, gets a copy that says it."""
+    write_sog(tmp_path / "whole.sog", columns_of(40, 1), antialiased=False)
+    assert completed(tmp_path / "whole.sog", tmp_path) == tmp_path / "whole.sog"
+    (tmp_path / "room").mkdir()
+    source = tmp_path / ("a.sog" if packed else "room/meta.json")
+    with zipfile.ZipFile(tmp_path / "whole.sog") as archive, zipfile.ZipFile(tmp_path / "a.sog", "w") as out:
+        meta = json.loads(archive.read("meta.json"))
+        del meta["shN"]["count"]
+        meta["shN"] |= told
+        for name in archive.namelist():
+            out.writestr(name, json.dumps(meta) if name == "meta.json" else archive.read(name))
+        out.extractall(tmp_path / "room")
+    (tmp_path / "copy").mkdir()
+    copy = completed(source, tmp_path / "copy")
+    found = json.loads(zipfile.ZipFile(copy).read("meta.json") if packed else copy.read_text())
+    assert found == {**meta, "shN": {**meta["shN"], "count": told.get("palette_size", 1 << 16)}}
+    assert len(zipfile.ZipFile(copy).namelist() if packed else list((tmp_path / "copy").iterdir())) == 8
+    model = load_model(source)
+    assert model.source == source and tool_request(tool)[1] not in (str(source), str(copy))
 
 
 def test_numbers_that_have_room_in_a_code_book_are_exact():

@@ -17,7 +17,7 @@ from mipmap_plugin.cli import main
 from mipmap_plugin.commands.ladders import Exports
 from mipmap_plugin.errors import OutputError, SettingsError
 from mipmap_plugin.formats.ply import read_ply
-from mipmap_plugin.formats.splat_transform import refuse_unread
+from mipmap_plugin.formats.readers import refuse_unread
 from mipmap_plugin.levels.tiles import write_tile
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
@@ -41,7 +41,8 @@ def test_adapt_reads_and_writes_spz(tmp_path, tool, capsys):
 
 UP_TO_2, NONE = "reads .spz up to version 2, and splat-transform writes 3 at least", "read no .spz"
 WITH_FILTER = "reads PLYs only, with a column filter_3D that .spz has no place for"
-UNREAD = [("gaussian-splats-3d", UP_TO_2), ("mkkellogg", UP_TO_2), ("gsplat-js", NONE), ("drei", NONE), ("mip", WITH_FILTER)]
+ONLY_2 = "UnityGaussianSplatting 1.1.1 reads .spz of version 2 only, and splat-transform writes 3 at least"
+UNREAD = [("gaussian-splats-3d", UP_TO_2), ("mkkellogg", UP_TO_2), ("gsplat-js", NONE), ("drei", NONE), ("mip", WITH_FILTER), ("unity", ONLY_2)]
 
 
 @pytest.mark.parametrize(("viewer", "why"), UNREAD)
@@ -59,6 +60,20 @@ def test_spz_for_several_viewers_is_written_with_a_warning_of_those_that_do_not_
     assert not recwarn.list
     with pytest.warns(UserWarning, match=r"GaussianSplats3D .*; antimatter15/splat, .* read no .spz; give a .ply by --output if it is for these too"):
         refuse_unread(tmp_path / "a.spz", ["spark", "gaussian-splats-3d", "antimatter15"])
+    with pytest.warns(UserWarning, match=r"PlayCanvas's engine .* read no \.spz, SuperSplat's editor does; give a \.ply by --output if"):
+        refuse_unread(tmp_path / "a.spz", ["playcanvas"])
+
+
+@pytest.mark.parametrize(
+    ("name", "viewer"),
+    [("a.sog", "unity"), ("a.sog", "three"), ("a.compressed.ply", "metalsplatter"), ("a.spz", "3dgs.cpp"), ("a.glb", "3dgs.cpp"), ("a.SOG", "brush")],
+)
+def test_no_format_is_written_for_a_viewer_that_does_not_read_it(tmp_path, tool, name, viewer):
+    base = wrap_model(tiny.ply(tmp_path / "base.ply"))
+    with pytest.raises(SettingsError, match=rf"{viewer} reads no .*; give a \.ply by --output"):
+        base.refuse_output(tmp_path / name, overwrite=False, viewer=viewer)
+    base.refuse_output(tmp_path / "a.ply", overwrite=False, viewer=viewer)
+    base.refuse_output(tmp_path / "a.sog", overwrite=False, viewer="gdgs")
 
 
 @pytest.mark.parametrize("ending", [".spz", ".compressed.ply", ".ply"])

@@ -69,7 +69,18 @@ def test_opacities_that_are_whole_numbers_are_fractions_and_no_logits(tmp_path, 
 
 
 
-@pytest.mark.parametrize("full", [np.uint8(255), np.float32(1)])
+@pytest.mark.parametrize("form", ["binary_little_endian", "binary_big_endian", "ascii"])
+def test_columns_of_16_bits_are_halves(tmp_path, form):
+    """PLY has no type for these; exporters call them ushort (Babylon.js #18816)."""
+    whole = load_vanilla(write_splats(tmp_path / "whole.ply"))
+    halves = {name: column.astype(np.float16).view(np.uint16) for name, column in splat_columns(5).items()}
+    model = load_vanilla(write(tmp_path / "a.ply", halves, form))
+    assert model.notes == ["its columns have 16 bits, read as half-precision floats"] and not model.extras
+    for name, tensor in whole.parameters().items():
+        torch.testing.assert_close(model.parameters()[name], tensor.half().float(), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("full", [np.uint8(255), np.float32(1), np.float32(255)])
 def test_rgb_stands_in_for_dc(tmp_path, full):
     columns = {name: column for name, column in splat_columns(2, 0).items() if not name.startswith("f_dc")}
     colors = {name: np.array([full, 0 * full], full.dtype) for name in ("red", "green", "blue")}

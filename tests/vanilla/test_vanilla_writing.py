@@ -69,6 +69,14 @@ def test_extra_columns_are_kept_until_rows_change(tmp_path):
     assert "segment" not in read_ply(adapted.save(tmp_path / "c.ply", provenance={})).columns
 
 
+def test_a_second_set_of_colors_is_left_out(tmp_path):
+    """Spark draws a cloud of points where a file has red, green and blue, Brush prefers them, and gsplat.js refuses columns of bytes."""
+    colors = {name: np.arange(5, dtype=np.uint8) for name in ("red", "green", "blue", "alpha")}
+    model = load_vanilla(write(tmp_path / "a.ply", splat_columns(5) | colors))
+    assert not model.extras and model.notes[0].startswith("its columns red, green and blue are left out")
+    assert list(read_ply(model.save(tmp_path / "b.ply", provenance={})).columns) == splat_names(15)
+
+
 def test_normals_are_kept_until_rows_change_where_there_are_any(tmp_path):
     normals = {"nx": np.full(5, 0.6, np.float32), "nz": np.full(5, 0.8, np.float32)}
     model = load_vanilla(write(tmp_path / "a.ply", splat_columns(5) | normals))
