@@ -66,7 +66,7 @@ class Traits:
 
     Attributes:
         same_for_all_views: Rows are splats, the same for every camera: the model has `rebuild`, and splats may be merged.
-        plain: The parameters are those of 3DGS, activated as there, so that a backend may move them itself (`Backend.render_to_step`).
+        plain: The parameters are those of 3DGS, activated as there, so that a backend may move them itself (`Backend.stepper`).
         moves: Gaussians depend on the camera's time.
         filtered: Each splat has a 3D filter, which only the original project's viewer applies: the model has `fused` and `bare`.
         placed: Trained in a coordinate frame or at an image size of its own: the model has `as_trained`.
