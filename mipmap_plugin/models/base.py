@@ -89,8 +89,11 @@ class Traits:
     thins: bool = False
 
 
+# The parameters of 3DGS.
+OF_3DGS = ("means", "scales", "quats", "opacities", "sh0", "shN")
+
 # Allowed names of parameters, each with a learning rate of its own (`config.LearningRates`). The first is required.
-PARAMETERS = ("means", "scales", "quats", "opacities", "sh0", "shN", "offsets", "features", CARRIED)
+PARAMETERS = (*OF_3DGS, "offsets", "features", CARRIED)
 
 
 @runtime_checkable  # for tools that check arguments by their annotations, such as pydantic
