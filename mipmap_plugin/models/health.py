@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.errors import CheckpointError
-from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.models.base import OF_3DGS, SplatModel
 
 Model = TypeVar("Model", bound="HasRows")
 Read = TypeVar("Read", bound="IsRead")
@@ -155,7 +155,7 @@ def coarse(rounded: int, splats: int, step: float) -> str:
 
 def holds_splats(model: SplatModel) -> bool:
     """Whether the rows of a model's parameters are splats, which `examine` counts; those of anchors, for one, are not."""
-    return {"means", "scales", "quats", "opacities", "sh0", "shN"} <= model.parameters().keys()
+    return set(OF_3DGS) <= model.parameters().keys()
 
 
 def examine(model: SplatModel) -> Health:
