@@ -22,7 +22,7 @@ from mipmap_plugin.formats.tags import with_tags
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.anchors.decoding import Anchors, decode
 from mipmap_plugin.models.anchors.files import AnchorFile, cfg_text, needs_views, refuse_others, to_columns, write_beside
-from mipmap_plugin.models.anchors.networks import appearance_size, packed, refuse_infinite
+from mipmap_plugin.models.anchors.networks import EMBEDDING, appearance_size, packed, refuse_infinite
 from mipmap_plugin.models.anchors.prefilter import in_view
 from mipmap_plugin.models.base import CARRIED, Traits
 from mipmap_plugin.models.columns import QUATERNION
@@ -213,7 +213,7 @@ class AnchorModel(ABC):
             if takers := [network for network, taken in self._inputs.items() if name in taken]:
                 notes.append(f"{extra} goes into {', '.join(takers)}")
         if "appearance" in self._weights:
-            count = len(self._weights["appearance"]["embedding.weight"])
+            count = len(self._weights["appearance"][EMBEDDING])
             upstream = "its project gives the n-th test view the appearance of the n-th training view (evaluate --appearance upstream)"
             notes.append(f"it has an appearance for each of {count} training views; any other camera gets their mean, where {upstream}")
         return notes
