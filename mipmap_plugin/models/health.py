@@ -170,8 +170,8 @@ def examine(model: SplatModel) -> Health:
         thin = thin[:, ~thin.all(0)]
     return Health(
         splats=len(scales),
-        nan={name: _rows_where(torch.isnan, tensor) for name, tensor in raw.items()},
-        infinite={name: _rows_where(torch.isinf, tensor) for name, tensor in raw.items()},
+        nan={name: rows_where(torch.isnan, tensor) for name, tensor in raw.items()},
+        infinite={name: rows_where(torch.isinf, tensor) for name, tensor in raw.items()},
         zero_quaternions=int((raw["quats"] == 0).all(1).sum()),
         extent=extent,
         huge=_rows(scales > extent) if extent > 0 else 0,
@@ -258,7 +258,7 @@ def _invalid(raw: dict[str, Tensor], scales: Tensor, opacities: Tensor) -> Tenso
     return ~valid
 
 
-def _rows_where(test: Callable[[Tensor], Tensor], values: Tensor) -> int:
+def rows_where(test: Callable[[Tensor], Tensor], values: Tensor) -> int:
     """The number of rows with a value for which `test` is True."""
     return sum(_rows(test(part)) for part in values.split(CHUNK))
 

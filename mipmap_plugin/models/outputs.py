@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -16,6 +17,7 @@ from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_glb, is_written, refuse_as_folder, refuse_exchange
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.health import rows_where
 from mipmap_plugin.models.places import CONVERTED, PARTS, REPORT, STATE
 
 # What is written into a model folder, of all families.
@@ -23,9 +25,6 @@ WRITTEN = (
     "cfg_args", "cameras.json", "input.ply", "exposure.json", "cfg.yml", "config.yml", "dataparser_transforms.json", "ckpts/*.pt",
     "nerfstudio_models/*.ckpt", "deform/*/deform.pth", "point_cloud/*/point_cloud.ply", "point_cloud/*/*.pt", "point_cloud/*/*.pth", f"*{REPORT}",
 )  # fmt: skip
-
-# Rows that are checked together, so that there is no second copy of all.
-CHUNK = 1 << 17
 
 # World units: SPZ, as splat-transform writes it, has 24 bits for a coordinate, 12 of them for parts of a unit. Splats farther away would be put 4,096
 # units elsewhere without a word.
@@ -121,7 +120,7 @@ def finite(parameters: Mapping[str, Tensor], most: float) -> dict[str, Tensor]:
         if name in cleaned:
             cleaned[name] = cleaned[name].nan_to_num(nan=torch.nan, posinf=high, neginf=low)
     for name, value in {**cleaned, "lengths": cleaned["scales"].exp()}.items():
-        if rows := sum(_wrong_rows(part, torch.inf if name in ("opacities", "quats") else most) for part in value.split(CHUNK)):
+        if rows := rows_where(partial(_is_wrong, most=torch.inf if name in ("opacities", "quats") else most), value):
             raise SettingsError(
                 f"{rows:,} of {len(value):,} rows hold a NaN, an infinity or more than {most:g} in {name}, so nothing is saved;"
                 " adapt less boldly, or to another scale"
@@ -129,10 +128,9 @@ def finite(parameters: Mapping[str, Tensor], most: float) -> dict[str, Tensor]:
     return cleaned
 
 
-def _wrong_rows(values: Tensor, most: float) -> int:
-    """The number of rows with a NaN, an infinity or a number above `most`."""
-    right = values.isfinite() if most == torch.inf else values.abs() <= most  # False for NaN
-    return len(values) - int(right.flatten(1).all(1).sum() if right.dim() > 1 else right.sum())
+def _is_wrong(values: Tensor, most: float) -> Tensor:
+    """Where values are NaN, infinite or above `most`."""
+    return ~(values.isfinite() & (values.abs() <= most))
 
 
 def _belongs(name: str, source: str) -> bool:
