@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -115,10 +116,8 @@ def orbit(
     Suitable for objects: the positions of the cameras of an unbounded scene do not follow from its splats. Raises SettingsError
     without splats or views.
     """
-    if isinstance(means, Gaussians):
-        gaussians = means
-        return Orbit.around(gaussians.means, up, lambda: sharp_size(gaussians)).views(size, count, generator)
-    return Orbit.around(means, up).views(size, count, generator)
+    around = Orbit.around(means.means, up, partial(sharp_size, means)) if isinstance(means, Gaussians) else Orbit.around(means, up)
+    return around.views(size, count, generator)
 
 
 def frame(means: Tensor) -> tuple[Tensor, float, bool]:
