@@ -32,13 +32,12 @@ from mipmap_plugin.scenes.trajectories import jittered, with_company
 ORBIT_PIXELS = 800
 ORBIT_VIEWS = 50
 
-# Views that are looked at to see whether they show anything; and the fraction of a view's splats before the near plane, mean over them, that is worth
-# a word. Floaters lie before a camera, but captures in common units have none of their splats there; in a tenth of these they have 2 %, in a
-# twentieth half.
+# Views that are looked at to see whether they show anything; and the mean fraction of their splats in front of the near plane that is worth a word.
+# Floaters lie close to cameras, but captures in usual units have no splats there; made ten times smaller they have 2 %, twenty times smaller half.
 LOOKED_AT, TOO_MANY = 16, 0.05
 
-# px: of a scene that no view shows larger there is nothing to adapt. And the fraction of the shorter side of a picture: an orbit fills nearly all of
-# it, unless the near plane keeps it away from a scene in small units; then pictures are of another zoom than a user looks from.
+# A scene that no view shows larger than so many px, or than this fraction of a picture's shorter side, is too small to adapt. In views of an orbit it
+# fills nearly all of a picture, unless it has such small units that the near plane keeps cameras farther away than a user's.
 LEAST_PIXELS, LEAST_SHARE = 16, 0.25
 
 # What to do about a scene in units so small that the near plane hides it.
@@ -52,10 +51,10 @@ ORBITED = (
 CAPTURE = "; this seems to be a capture, and from where it was photographed is a guess: seen from there it may look worse than its base"
 VIEWED = ", or adapt for what you look at (mipmap-plugin view)"
 
-# Ratio of focal lengths, px, of which views want files as different as scales at such a ratio: two lenses at 5 times cost a capture 10 of 12 dB.
+# Lenses whose focal lengths (px) have a larger ratio need different files, as scales of that ratio do. A ratio of 5 costs a capture 10 of 12 dB.
 UNLIKE = 3.0
 
-# Standard deviations of a splat that are seen of it; and near planes at which views keep clear of a scene (`orbit`).
+# How far a splat is visible, in standard deviations; and the distance that views of an orbit keep from a scene, in near planes.
 SEEN, CLEAR = 3, 2
 
 
@@ -174,16 +173,16 @@ def showing(views: Sequence[Camera], means: Tensor, near: float) -> list[Camera]
 
 
 def _inside(views: Sequence[Camera], means: Tensor, near: float) -> Iterator[Tensor]:
-    """Which `means` [N, 3] lie in the pictures of views, farther than the near plane: [V, N] bool, for some views after the others."""
+    """Which `means` [N, 3] lie in the pictures of views, farther than the near plane: [V, N] bool for each batch of views."""
     for view in in_batches(views, means):
         yield view.in_picture(view.to_camera(means.detach()), near)
 
 
 @announced("examining views")
 def refuse_blind(views: Sequence[Camera], model: SplatModel, near: float, image_of: Callable[[Camera], Tensor], scale: float = 1.0) -> None:
-    """Raise SettingsError for views that show nothing, or a speck: of cameras of another scene, or of splats that no renderer draws, for example.
+    """Raise SettingsError if the views show nothing, or a speck: the cameras may be of another scene, or no renderer draws the splats, for example.
 
-    `near`: the near plane, in world units; `image_of`: a view's image [h, w, 3]; `scale`: that is wanted, for a zoom-in makes specks large.
+    `near`: the near plane, in world units; `image_of`: a view's image [h, w, 3]; `scale`: the one adapted to, since a zoom-in makes specks large.
     """
     some, means = evenly(views, LOOKED_AT), model.parameters()["means"]
     if not showing(some, means, near):  # a few of many cameras may see what is left of a scene that was cut down
@@ -202,7 +201,7 @@ def refuse_blind(views: Sequence[Camera], model: SplatModel, near: float, image_
 
 
 def _draws(view: Camera, model: SplatModel, near: float) -> bool:
-    """Whether a row of the parameters that is opaque enough to be drawn lies in the view, farther than the near plane."""
+    """Whether a row of the parameters that is opaque enough to be drawn lies in the view's picture, farther than the near plane."""
     inside = view.in_picture(view.to_camera(model.parameters()["means"].detach()), near)
     return bool(inside.any()) and bool((row_opacities(model, [view])[inside] >= MIN_ALPHA).any())
 
