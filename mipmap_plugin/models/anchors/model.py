@@ -30,7 +30,6 @@ from mipmap_plugin.models.health import LARGEST
 from mipmap_plugin.models.inria_folder import write_folder
 from mipmap_plugin.models.outputs import finite, refuse_parts
 from mipmap_plugin.models.raw import MIN_SCALE
-from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting.rotations import unit_quaternions
 
 # Views sampled for the opacities of anchors, and for reshaping: the networks vary slowly with the direction.
@@ -78,10 +77,6 @@ class AnchorModel(ABC):
         """The splats of the anchors in view, activated: SH of degree 0, opacities above 0."""
         rows = (self._chosen(camera) & self._in_view(camera)).nonzero()[:, 0]
         return decode(self._anchors(rows, camera), self._weights, self._inputs, camera)[0]
-
-    def bake(self, camera: Camera) -> VanillaModel:
-        """A plain 3DGS model of what this camera sees, valid near this view only: colors, opacities and shapes depend on the direction."""
-        return VanillaModel.from_gaussians(self.gaussians(camera), self.trained)
 
     def parameters(self) -> dict[str, Tensor]:
         """The raw parameters by name, without copying them."""

@@ -219,11 +219,6 @@ def _memories_of(field: Field) -> Sequence[Memory]:
     return (changes,) if field.slopes is None else (changes, Memory(field.slopes))
 
 
-def moved_to(field: Field, canonical: VanillaModel, time: float) -> Gaussians:
-    """The splats at `time`, by a new evaluation of the field."""
-    return field.moved(canonical, field.changes(canonical.parameters()["means"].detach(), time))
-
-
 def read_canonical(path: str | Path, iteration: int | None, family: str) -> tuple[VanillaModel, Path]:
     """The canonical splats of a moving scene, and the file of their network. Raises CheckpointError."""
     checkpoint = detect_as(path, (family,), iteration=iteration)
