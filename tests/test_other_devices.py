@@ -29,7 +29,7 @@ from mipmap_plugin.backends.conformance.cases import covariances
 from mipmap_plugin.backends.cpu import nearest_along
 from mipmap_plugin.cli import main
 from mipmap_plugin.effects import SURFEL, Effects
-from mipmap_plugin.evaluation.evaluate import evaluate
+from mipmap_plugin.evaluation.evaluate import all_rows, evaluator_of
 from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.screen_filters import USUAL_EPS2D
 
@@ -141,7 +141,7 @@ def test_photographs_and_evaluation_there(tmp_path, monkeypatch):
     with pretended.pretending():
         wrapped = wrap_model(tiny.model().to(pretended.DEVICE), cameras=VIEWS, backend="reference")
         wrapped.adapt(2, steps=1, images=scene, **FEW)
-        rows = evaluate(wrapped, scene, (1 / 2,), ("paper",), "P3", steps=1, **FEW)
+        rows = all_rows(wrapped, evaluator_of(wrapped, scene, "P3"), (1 / 2,), ("paper",), steps=1, **FEW)
     assert all(row.psnr_db > 10 for row in rows)
 
 
