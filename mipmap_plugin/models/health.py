@@ -15,8 +15,7 @@ from torch import Tensor
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.models.base import OF_3DGS, SplatModel
 
-Model = TypeVar("Model", bound="HasRows")
-Read = TypeVar("Read", bound="IsRead")
+Model = TypeVar("Model", bound="IsRead")
 
 
 def units(length: float, digits: int) -> str:
@@ -24,19 +23,13 @@ def units(length: float, digits: int) -> str:
     return f"{length:.{digits}g}" if length < 10**digits - 0.5 else f"{length:,.0f}"
 
 
-class HasRows(Protocol):
-    """A model whose rows can be removed."""
-
-    notes: list[str]
+class IsRead(SplatModel, Protocol):
+    """A model of splats that is checked when it is read."""
 
     def keep_rows(self: Model, keep: Tensor) -> Model:
         """A new model of the rows where `keep` [N] is True."""
 
-
-class IsRead(HasRows, SplatModel, Protocol):
-    """A model of splats that is checked when it is read."""
-
-    def noted(self: Read, note: str) -> Read:
+    def noted(self: Model, note: str) -> Model:
         """The same model with one more note."""
 
 
@@ -208,7 +201,7 @@ def drop(model: Model, mask: Tensor, why: str, source: Path | str | None) -> Mod
     return kept
 
 
-def without_invalid(model: Read) -> Read:
+def without_invalid(model: Model) -> Model:
     """The model without splats that are not finite once activated, with a note. Raises CheckpointError if none or few are left (`refuse_few`).
 
     Once for each model it warns of what is doubtful (`Health.doubts`), such as positions that float32 does not hold: a file of doubles loses them
