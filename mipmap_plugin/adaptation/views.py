@@ -67,7 +67,7 @@ class ViewSchedule:
         self._gathering = math.ceil(config.gathering * config.steps)  # steps during which new views are introduced
 
     @property
-    def views(self) -> int:
+    def view_count(self) -> int:
         """The number of views."""
         return len(self._rounds.views)
 
