@@ -55,6 +55,10 @@ class TrainedScale:
     keeps_filter: bool = False
     up: tuple[float, float, float] | None = None
 
+    def told(self) -> str:
+        """The screen filter in words: "classic, 0.3 px²"."""
+        return f"{self.screen_filter}, {self.eps2d:g} px²"
+
     def drawn_with(self, target: Effects) -> TrainedScale:
         """Of splats that were adapted to another screen filter."""
         return replace(self, screen_filter=target.screen_filter, eps2d=target.eps2d)

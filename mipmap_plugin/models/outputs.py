@@ -71,7 +71,7 @@ def refuse_format(path: Path, trained: TrainedScale, means: Tensor) -> None:
     if not len(means):
         raise SettingsError(f"{path}: there are no splats to write, which this format needs; give a .ply")
     if trained.keeps_filter:
-        own = f"the filter of their own project ({trained.screen_filter}, {trained.eps2d:g} px²)"
+        own = f"the filter of their own project ({trained.told()})"
         raise SettingsError(f"{path}: these splats need {own}; give a .ply or a folder, or adapt for a viewer if the family allows it")
     if not is_glb(path):
         refuse_exchange(path)
@@ -101,8 +101,7 @@ def drawn_otherwise(path: Path, trained: TrainedScale) -> str:
     """That many viewers of the exchange format of `path` do not draw splats as they were trained, in a sentence; "" if they do, or of a .ply."""
     if trained.screen_filter == TrainedScale.screen_filter or not is_written(path):
         return ""
-    own = f"{trained.screen_filter}, {trained.eps2d:g} px²"
-    right = f"the file is right where splats are drawn as in training ({own})"
+    right = f"the file is right where splats are drawn as in training ({trained.told()})"
     return f"{right}, which not all viewers of {_ending(path)} do; for others adapt for a viewer"
 
 
