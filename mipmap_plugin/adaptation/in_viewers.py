@@ -1,4 +1,4 @@
-"""What renderers show that a file is not steered by: each viewer of several, and a renderer of the base's training, which shows the base itself."""
+"""Renderers besides those that steer a run: each of several viewers, one that draws as the base's training did, and viewers that round positions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.progress import announced
 from mipmap_plugin.splatting.packing import in_two_steps, packed
 
-# Views and splats that are looked at for what a viewer's positions do, and the fraction of the splats that has to be displaced for a word about it.
+# Views and splats by which it is measured how far a viewer that rounds positions displaces splats, and the fraction of displaced ones worth a word.
 LOOKED_AT, SAMPLES, DISPLACED = 4, 1 << 14, 0.5
 
 

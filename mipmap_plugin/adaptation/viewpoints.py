@@ -22,17 +22,17 @@ from mipmap_plugin.process.threads import side_by_side
 from mipmap_plugin.scenes.orbits import Orbit, sharp_size, sizes
 from mipmap_plugin.splatting.harmonics import C0
 
-# A view stands in fog, or behind a wall, if more than half of what it shows are splats larger (`sizes`) than FOG of its shorter side. Half of what
-# photographs show are splats of 0.01 to 0.07 in four captures, of such views 0.1 to 4; limits of 0.035 to 0.2 choose as well.
+# A view stands in fog, or behind a wall, if more than half of what it shows are splats larger (`sizes`) than FOG of its shorter side. The median is
+# 0.01 to 0.07 in photographs of four captures, and 0.1 to 4 in such views; limits of 0.035 to 0.2 choose as well.
 FOG = 0.1
 
 # px: the shorter side of the pictures that tell.
 LOOK = 64
 
-# Times as many views as are wanted are tried at most. Of a kitchen that was photographed from one side a quarter are clear.
+# At most so many times as many views are tried as are wanted. Of a kitchen that was photographed from one side a quarter are clear.
 ROUNDS = 4
 
-# Where a time budget allows to look at fewer, any view is taken.
+# If a time budget allows to look at fewer views than this, any are taken.
 LEAST_LOOKS = 16
 
 INSTEAD = "give the scene's cameras (--cameras), or adapt for what you look at (mipmap-plugin view)"
