@@ -206,7 +206,7 @@ def test_a_check_waits_once_there():
     for count in (1, 5):
         with pretended.pretending() as device:
             there = truth.to(pretended.DEVICE)
-            validation = Validation([view] * count, [], 1.0, lambda _, there=there: there, lambda *_, there=there: there, "area")
+            validation = Validation([view] * count, [], 1.0, lambda _, there=there: there, [lambda *_, there=there: there], "area")
             validation.steer(tiny.model().to(pretended.DEVICE))
             waits.append(device.waits.total())
     assert waits == [1, 1]

@@ -58,8 +58,8 @@ def psnr_per_viewer(validation: Validation, backend: Backend, targets: Mapping[s
     """PSNR (dB) of a model in each viewer on the views that choose among states, where it is made for several; {} for one."""
     if len(targets) == 1:
         return {}
-    first, *further = [Renderer(backend, target) for target in targets.values()]
-    psnrs = replace(validation, render=first, further_renders=further).viewer_psnrs(model, validation.choosing)
+    renders = [Renderer(backend, target) for target in targets.values()]
+    psnrs = replace(validation, renders=renders).viewer_psnrs(model, validation.choosing)
     return dict(zip(targets, psnrs, strict=True))
 
 
@@ -72,7 +72,7 @@ def psnr_as_trained(
     """
     if validation.scale == 1 or not validation.choosing or effects in targets.values():
         return None
-    return replace(validation, render=Renderer(backend, effects), further_renders=[]).viewer_psnrs(base, validation.choosing)[0]
+    return replace(validation, renders=[Renderer(backend, effects)]).viewer_psnrs(base, validation.choosing)[0]
 
 
 def better_as_trained(as_trained: float | None, psnr: float, effects: Effects) -> list[str]:

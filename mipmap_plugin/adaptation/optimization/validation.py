@@ -85,9 +85,8 @@ class Validation:
     choosing: Sequence[Camera]
     scale: float
     truth: Callable[[Camera], Tensor]  # a view of the base scale -> the image to compare with
-    render: Callable[[Gaussians, Camera], Tensor]  # splats and a camera of the new scale -> image
+    renders: Sequence[Callable[[Gaussians, Camera], Tensor]]  # splats and a camera of the new scale -> image; of each viewer they are adapted for
     resize: str  # the filter that brings an image to the truth's size
-    further_renders: Sequence[Callable[[Gaussians, Camera], Tensor]] = ()  # `render` of further viewers that the same splats are adapted for
 
     def viewer_psnrs(self, model: SplatModel, views: Sequence[Camera]) -> list[float]:
         """The mean PSNR (dB) over views, per viewer, of images clamped as a display does, each at most 54 (INVISIBLE_ERROR); 0 without views."""
@@ -96,9 +95,8 @@ class Validation:
     @torch.no_grad()
     def _errors(self, model: SplatModel, views: Sequence[Camera]) -> list[list[float]]:
         """The mean square error of each view, per viewer."""
-        renders = (self.render, *self.further_renders)
         if not views:
-            return [[] for _ in renders]
+            return [[] for _ in self.renders]
         shared = model.gaussians(views[0]) if model.traits.same_for_all_views else None
         cameras = [view.zoomed(self.scale) for view in views]
         threads = max_threads(model.parameters()["means"], cameras[0])
@@ -107,7 +105,7 @@ class Validation:
             image = draw(cameras[number]).clamp(0, 1)
             return difference_from(self.truth(views[number]), image, self.resize).square().mean()
 
-        draws = [_drawing(render, model, shared, cameras) for render in renders]
+        draws = [_drawing(render, model, shared, cameras) for render in self.renders]
         errors = [list(side_by_side(partial(error, draw), range(len(views)), threads)) for draw in draws]
         return [torch.stack(each).tolist() for each in errors]  # a GPU is waited for once, and not for each view
 
@@ -170,7 +168,7 @@ def _visible_db(errors: Sequence[float]) -> float:
 
 def no_validation(truth: Callable[[Camera], Tensor], render: Callable[[Gaussians, Camera], Tensor]) -> Validation:
     """Validation without views, for a training, in which no step is undone."""
-    return Validation([], [], 1.0, truth, render, "area")
+    return Validation([], [], 1.0, truth, [render], "area")
 
 
 def split_validation(
