@@ -56,7 +56,7 @@ def detect(path: str | Path, *, iteration: int | None = None) -> Checkpoint:
     return _recognize(path)[0]
 
 
-def detect_as(path: str | Path, families: tuple[str, ...], *, iteration: int | None = None) -> Checkpoint:
+def detect_as(path: str | Path, families: tuple[str, ...], *, iteration: int | None) -> Checkpoint:
     """As `detect`, but raises CheckpointError for any family not in `families`."""
     checkpoint = detect(path, iteration=iteration)
     if checkpoint.family in families:

@@ -86,7 +86,7 @@ def refuse_far(path: Path, means: Tensor, instead: str) -> None:
         raise SettingsError(f"{path}: {far:,} of {len(means):,} splats {where}; remove them, move or shrink the scene, or {instead}")
 
 
-def without_place(path: Path, extras: Iterable[str], sh_degree: int = 0) -> str:
+def without_place(path: Path, extras: Iterable[str], sh_degree: int) -> str:
     """What the file at `path` will not hold, in a sentence: columns that 3DGS does not define, high SH bands; "" if it holds everything."""
     if not is_written(path):
         return ""

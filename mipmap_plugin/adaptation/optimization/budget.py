@@ -134,7 +134,7 @@ def plan_note(run: Run, config: AdaptConfig) -> str:
     return f" ({taken}planned for the time budget in place of {config.steps})"
 
 
-def no_steps_notes(run: Run, config: AdaptConfig, share: float = 1.0) -> list[str]:
+def no_steps_notes(run: Run, config: AdaptConfig, share: float) -> list[str]:
     """That a time budget, of which the run has a share, left no time for steps, and which one would; empty if it did."""
     if config.time_budget_s is None or run.step or run.seconds < config.time_budget_s:
         return []
