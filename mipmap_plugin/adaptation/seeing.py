@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from mipmap_plugin.adaptation.views import showing
+from mipmap_plugin.adaptation.shown import showing
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera
 

@@ -27,6 +27,7 @@ from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Qu
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, unrounded, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, simulated, versions
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer, ends_run
+from mipmap_plugin.adaptation.shown import refuse_blind, remarks, showing, too_unlike
 from mipmap_plugin.adaptation.start.candidates import UNMATCHED, StartSearch
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
 from mipmap_plugin.adaptation.start.problem import StartProblem
@@ -35,7 +36,7 @@ from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind, remarks, showing, too_unlike
+from mipmap_plugin.adaptation.views import choose_views, over_band
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Calls
 from mipmap_plugin.camera import ONE_PIXEL, Camera, digest_of, evenly
@@ -259,9 +260,8 @@ class Session:
 
     def _fingerprint(self) -> str:
         """A hash of everything that a run depends on, so that a state is never resumed as another run."""
-        base = digest_of_model(self.base)
+        base = digest_of_model(self.base) + ("" if self.finer is None else digest_of_parameters(self.finer.model))
         targets = [asdict(target) for target in self.targets.values()]
-        base += "" if self.finer is None else digest_of_parameters(self.finer.model)
         settings, views = self.config.model_dump(), digest_of(self.views)
         facts = [base, dict(self.request.inputs), self.scale, settings, self.backend.name, asdict(self.base_effects), targets, views]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
