@@ -38,7 +38,7 @@ from mipmap_plugin.models.exposure import exposed
 from mipmap_plugin.models.mip import MipModel
 from mipmap_plugin.models.moving.deformable import DeformNetwork
 from mipmap_plugin.models.moving.hexplane import HexPlane
-from mipmap_plugin.models.moving.model import MovingModel, moved_to
+from mipmap_plugin.models.moving.model import MovingModel
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting.rotations import rotations
 
@@ -130,11 +130,11 @@ def _fields(bench: Bench) -> Iterator[Pair]:
     fields = {"Deformable-3D-Gaussians": DeformNetwork(moving.deform_state()), "4DGaussians": HexPlane(moving.hexplane_state(), {})}
     for name, field in fields.items():
         canonical = bench.model()
-        moved = bench.draw(lambda camera, field=field, canonical=canonical: moved_to(field, canonical, camera.time or 0.0))
+        moved = bench.draw(lambda camera, field=field, canonical=canonical: moving.moved_to(field, canonical, camera.time or 0.0))
         yield Pair("time", name, moved, bench.draw(canonical.gaussians), True)
     state = {name: torch.zeros_like(held) if name.startswith("gaussian_") else held for name, held in moving.deform_state().items()}
     canonical, unmoved = bench.model(), DeformNetwork(state)
-    evaluated = bench.draw(lambda camera: moved_to(unmoved, canonical, camera.time or 0.0))
+    evaluated = bench.draw(lambda camera: moving.moved_to(unmoved, canonical, camera.time or 0.0))
     yield Pair("time", "a still scene of Deformable-3D-Gaussians", evaluated, bench.draw(MovingModel("", canonical, unmoved).gaussians), False)
 
 
@@ -156,7 +156,8 @@ def _anchors(bench: Bench, folder: Path) -> Iterator[Pair]:
         models.append(load_model(folder / str(appearance)).copy())
     plain, dressed = models
     scene = f"Scaffold-GS, {ANCHORS:,} anchors of 10"
-    yield Pair("view-dependent geometry", scene, drawn(plain.gaussians), drawn(plain.bake(behind).copy().gaussians), True)
+    fixed = VanillaModel.from_gaussians(plain.gaussians(behind)).copy()
+    yield Pair("view-dependent geometry", scene, drawn(plain.gaussians), drawn(fixed.gaussians), True)
     yield Pair("appearance embedding", f"{scene}, 32 numbers a view", drawn(dressed.gaussians), drawn(plain.gaussians), True)
 
 

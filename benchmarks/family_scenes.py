@@ -162,7 +162,7 @@ def trained(world: SplatModel, train: Sequence[Camera], pictures: Pictures) -> S
     def render(gaussians: Gaussians, camera: Camera) -> Tensor:
         return backend.render(gaussians, camera, effects).image
 
-    task = Task(train, 1.0, pictures, render, False, no_validation(pictures, render))
+    task = Task(train, 1.0, pictures, [render], False, no_validation(pictures, render))
     run = Run.start(student, task, TRAINING)
     adapt(run, task, TRAINING, lambda run: sys.exit(130))
     return run.student

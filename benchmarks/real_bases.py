@@ -20,7 +20,7 @@ import tyro
 from pages import write_page
 
 from mipmap_plugin import load_scene, wrap_model
-from mipmap_plugin.evaluation.evaluate import Row, evaluate
+from mipmap_plugin.evaluation.evaluate import Row, all_rows, evaluator_of
 from mipmap_plugin.evaluation.report import records, table
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.recipes import RECIPES as KNOWN
@@ -68,7 +68,7 @@ def main(
         recipes = recipe or (RECIPES if max(SCALES[base]) > 1 else (*RECIPES, "thorough"))
         wrapped = wrap_model(data / "checkpoints" / "bases" / base, backend=backend)
         scene = load_scene(data / "images" / base.split("_")[0])
-        rows = kept(output / f"{base}.json", recipes) + evaluate(wrapped, scene, SCALES[base], recipes, "P3")
+        rows = kept(output / f"{base}.json", recipes) + all_rows(wrapped, evaluator_of(wrapped, scene, "P3"), SCALES[base], recipes)
         rows.sort(key=lambda row: (abs(math.log2(row.scale)), recipe_of(row) is not None))
         write_json(output / f"{base}.json", records(rows), overwrite=True)
         print(f"{base}\n{table(rows)}\n", flush=True)

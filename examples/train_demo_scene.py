@@ -56,7 +56,7 @@ def train(model: VanillaModel, views: list[Camera], truth: dict[Camera, Tensor],
         return backend.render(gaussians, camera, effects).image
 
     # The loop zooms each view by the scale; at scale 1 that is a copy, so truth is looked up by the view itself.
-    task = Task(views, 1.0, truth.__getitem__, render, True, no_validation(truth.__getitem__, render))
+    task = Task(views, 1.0, truth.__getitem__, [render], True, no_validation(truth.__getitem__, render))
     adapt(Run.start(student, task, config), task, config, on_interrupt=lambda run: None)
     return student
 

@@ -15,6 +15,9 @@ from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.moving.model import Field
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.wrap import Adapted, Wrapped
 
@@ -31,6 +34,11 @@ def layers(sizes: dict[str, tuple[int, int]], seed: int, gain: float = 1.0) -> d
         state[f"{name}.weight"] = gain * torch.randn(outputs, inputs, generator=rng) / inputs**0.5
         state[f"{name}.bias"] = 0.1 * torch.randn(outputs, generator=rng)
     return state
+
+
+def moved_to(field: Field, canonical: VanillaModel, time: float) -> Gaussians:
+    """The splats at `time`, by a new evaluation of the field."""
+    return field.moved(canonical, field.changes(canonical.parameters()["means"].detach(), time))
 
 
 def deform_state(timenet: bool = False, six_dof: bool = False, width: int = 256, seed: int = 0) -> dict[str, Tensor]:

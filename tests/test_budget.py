@@ -30,7 +30,7 @@ def known_pace(monkeypatch):
 
 def a_task(views: int) -> Task:
     truth, render = (lambda view: torch.zeros(*view.size, 3)), (lambda splats, camera: torch.zeros(*camera.size, 3))
-    return Task(tiny.cameras(views), 1 / 4, truth, render, False, no_validation(truth, render))
+    return Task(tiny.cameras(views), 1 / 4, truth, [render], False, no_validation(truth, render))
 
 
 def a_run(seconds: float, step: int = 0) -> Run:
@@ -168,8 +168,8 @@ def test_validation_is_measured_as_it_is_done_in_the_middle_of_large_views_and_i
     truth = cache(lambda view: draw(None, view))
     for view in steering:  # which were used to choose the start
         truth(view)
-    validation = Validation(steering, choosing, 1.0, truth, draw, "area", [draw])
-    task = replace(a_task(2), views=whole[:2], scale=1.0, render=draw, validation=validation)
+    validation = Validation(steering, choosing, 1.0, truth, [draw, draw], "area")
+    task = replace(a_task(2), views=whole[:2], scale=1.0, renders=[draw], validation=validation)
     pace = Pace.of(tiny.model(5), task)
     assert pace.a_view == budget.STEP_OVER_IMAGE * 40 * 30
     assert pace.a_check == 2 * 2 * 64

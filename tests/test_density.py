@@ -289,8 +289,8 @@ def test_two_views_in_one_step_count_as_two_views_each_with_its_own_gradient():
             each.abs_()
     config = AdaptConfig(steps=1, views_per_step=2, densify_gradient=1.0, rates=LearningRates())
     black = lambda view: torch.zeros(1, 1, 1)  # noqa: E731
-    validation = Validation(views, views, 1.0, black, lambda gaussians, camera: torch.zeros(1, 1, 1), "area")
-    task = Task(views, 1.0, black, render, white_background=False, validation=validation)
+    validation = Validation(views, views, 1.0, black, [lambda gaussians, camera: torch.zeros(1, 1, 1)], "area")
+    task = Task(views, 1.0, black, [render], white_background=False, validation=validation)
     run = Run.start(student, task, config)
     optimize(run, task, config, lambda run: None)
     expected = ScreenGradients(COUNT, torch.device("cpu"))

@@ -13,7 +13,7 @@ from PIL import Image
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation import measure, photographs, protocols
-from mipmap_plugin.evaluation.evaluate import Evaluator, Row, evaluate, means, training_free_rows
+from mipmap_plugin.evaluation.evaluate import Evaluator, Row, all_rows, evaluator_of, means, training_free_rows
 from mipmap_plugin.evaluation.metrics import SAME_DB, psnr, ssim
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.evaluation.published import PUBLISHED, published
@@ -41,6 +41,10 @@ def scene(tmp_path_factory):
 @pytest.fixture
 def model():
     return wrap_model(tiny.model(), cameras=tiny.cameras())
+
+
+def evaluate(model, scene, scales, recipes, protocol, perceptual=None, **settings):
+    return all_rows(model, evaluator_of(model, scene, protocol, perceptual), scales, recipes, **settings)
 
 
 # Metrics

@@ -11,7 +11,7 @@ sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))  # its modules im
 from captures import Row, joined, main
 from made_captures import CAPTURES
 
-from mipmap_plugin.adaptation.views import showing
+from mipmap_plugin.adaptation.shown import showing
 from mipmap_plugin.evaluation.measure import views_seen
 from mipmap_plugin.formats.atomic import write_json
 

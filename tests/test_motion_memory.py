@@ -19,7 +19,6 @@ from mipmap_plugin.models.base import Traits
 from mipmap_plugin.models.moving import memory
 from mipmap_plugin.models.moving.hexplane import HexPlane
 from mipmap_plugin.models.moving.memory import Memory
-from mipmap_plugin.models.moving.model import moved_to
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.wrap import wrap_model
@@ -46,7 +45,7 @@ def at_times(count):
 def test_what_is_kept_shows_what_an_evaluation_shows(tmp_path, write):
     model = load_model(write(tmp_path / "m"))
     for _ in range(2):
-        known, exact = model.gaussians(moving.at(0.4)), moved_to(model.field, model.canonical, 0.4)
+        known, exact = model.gaussians(moving.at(0.4)), moving.moved_to(model.field, model.canonical, 0.4)
         for name in ("means", "scales", "quats", "opacities", "sh"):
             assert torch.equal(getattr(known, name), getattr(exact, name))
 
@@ -62,7 +61,7 @@ def test_a_moment_is_evaluated_once_for_a_model_and_its_copies_and_again_where_s
     with torch.no_grad():
         student.parameters()["means"][3] += 0.1
     assert not torch.equal(student.gaussians(moving.at(0.5)).means[3], model.gaussians(moving.at(0.5)).means[3])
-    assert torch.equal(student.gaussians(moving.at(0.5)).means, moved_to(model.field, student.canonical, 0.5).means)
+    assert torch.equal(student.gaussians(moving.at(0.5)).means, moving.moved_to(model.field, student.canonical, 0.5).means)
     assert evaluated == [0.5, 0.5]  # what was known of the base still is
 
 
@@ -82,7 +81,7 @@ def test_a_followed_hexplane_moves_splats_along_its_slopes(tmp_path):
     model.follow(reach=1.0)
     with torch.no_grad():
         model.parameters()["means"].add_(1e-3)
-    known, exact = model.gaussians(moving.at(0.4)).means, moved_to(model.field, model.canonical, 0.4).means
+    known, exact = model.gaussians(moving.at(0.4)).means, moving.moved_to(model.field, model.canonical, 0.4).means
     stale = model.field.moved(model.canonical, model.field.changes(model.held, 0.4)).means
     assert float((known - exact).abs().mean()) < float((stale - exact).abs().mean()) / 3
 
@@ -149,11 +148,11 @@ def test_a_followed_model_moves_its_splats_as_before_until_they_are_far_off(tmp_
     with torch.no_grad():
         student.parameters()["means"].add_(0.05)
     student.follow(reach=0.1)
-    assert torch.equal(student.gaussians(camera).means, moved_to(model.field, student.canonical, 0.7).means)
+    assert torch.equal(student.gaussians(camera).means, moving.moved_to(model.field, student.canonical, 0.7).means)
     with torch.no_grad():
         student.parameters()["means"].add_(0.01)
     release(student)
-    assert torch.equal(student.gaussians(camera).means, moved_to(model.field, student.canonical, 0.7).means)
+    assert torch.equal(student.gaussians(camera).means, moving.moved_to(model.field, student.canonical, 0.7).means)
 
 
 def test_rows_that_are_left_move_as_before_without_an_evaluation(tmp_path, monkeypatch):

@@ -18,18 +18,18 @@ from mipmap_plugin import load_model, load_scene, wrap_model
 from mipmap_plugin.adaptation.optimization import run
 from mipmap_plugin.adaptation.optimization.validation import Validation
 from mipmap_plugin.adaptation.pixel_size import mean_pixel_size
+from mipmap_plugin.adaptation.shown import remarks, showing
 from mipmap_plugin.adaptation.start import merging
 from mipmap_plugin.adaptation.start.blend_weights import may_show
 from mipmap_plugin.adaptation.start.closed_form import closed_form
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
-from mipmap_plugin.adaptation.views import remarks, showing
 from mipmap_plugin.backends import gsplat, inria
 from mipmap_plugin.backends.conformance.cases import covariances
 from mipmap_plugin.backends.cpu import nearest_along
 from mipmap_plugin.cli import main
 from mipmap_plugin.effects import SURFEL, Effects
-from mipmap_plugin.evaluation.evaluate import evaluate
+from mipmap_plugin.evaluation.evaluate import all_rows, evaluator_of
 from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.screen_filters import USUAL_EPS2D
 
@@ -141,7 +141,7 @@ def test_photographs_and_evaluation_there(tmp_path, monkeypatch):
     with pretended.pretending():
         wrapped = wrap_model(tiny.model().to(pretended.DEVICE), cameras=VIEWS, backend="reference")
         wrapped.adapt(2, steps=1, images=scene, **FEW)
-        rows = evaluate(wrapped, scene, (1 / 2,), ("paper",), "P3", steps=1, **FEW)
+        rows = all_rows(wrapped, evaluator_of(wrapped, scene, "P3"), (1 / 2,), ("paper",), steps=1, **FEW)
     assert all(row.psnr_db > 10 for row in rows)
 
 
@@ -206,7 +206,7 @@ def test_a_check_waits_once_there():
     for count in (1, 5):
         with pretended.pretending() as device:
             there = truth.to(pretended.DEVICE)
-            validation = Validation([view] * count, [], 1.0, lambda _, there=there: there, lambda *_, there=there: there, "area")
+            validation = Validation([view] * count, [], 1.0, lambda _, there=there: there, [lambda *_, there=there: there], "area")
             validation.steer(tiny.model().to(pretended.DEVICE))
             waits.append(device.waits.total())
     assert waits == [1, 1]

@@ -15,7 +15,7 @@ from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SceneError
-from mipmap_plugin.evaluation.evaluate import evaluate
+from mipmap_plugin.evaluation.evaluate import all_rows, evaluator_of
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.formats.images import read_image, write_image
 from mipmap_plugin.models import load_model
@@ -89,7 +89,8 @@ def test_photographs_go_with_their_cameras(run):
 
 
 def test_a_checkpoint_without_cameras_is_judged_by_those_of_its_scene(run):
-    rows = evaluate(wrap_model(run[0], backend="reference"), load_scene(run[1]), [1], [], "P3")
+    model = wrap_model(run[0], backend="reference")
+    rows = all_rows(model, evaluator_of(model, load_scene(run[1]), "P3"), [1], [])
     assert rows[0].psnr_db > 50
 
 

@@ -122,9 +122,9 @@ def test_merged_splats_may_be_worse_than_the_base_where_steps_regain_it_in_sever
 
 
 def test_viewers_take_turns():
-    first, *others = colored(0.0, 0.5, 1.0)
-    task = Task([], 1.0, first, first, False, Validation([], [], 1.0, first, first, "area"), further_renders=others)
-    assert [task.renderer(draw) for draw in range(5)] == [first, *others, first, others[0]]
+    first, second, third = renders = colored(0.0, 0.5, 1.0)
+    task = Task([], 1.0, first, renders, False, Validation([], [], 1.0, first, renders, "area"))
+    assert [task.renderer(draw) for draw in range(5)] == [first, second, third, first, second]
 
 
 def test_each_viewer_draws_for_the_gradient(monkeypatch, pair):
@@ -144,7 +144,7 @@ def test_each_viewer_draws_for_the_gradient(monkeypatch, pair):
 
 def test_the_mean_square_over_viewers_steers_and_the_worst_chooses():
     cameras, shows = tiny.cameras(2), colored(0.4, 0.1, 0.49)
-    judge = Validation(cameras, cameras, 1.0, lambda view: torch.full((*view.size, 3), 0.5), shows[0], "area", shows[1:])
+    judge = Validation(cameras, cameras, 1.0, lambda view: torch.full((*view.size, 3), 0.5), shows, "area")
     model = SimpleNamespace(gaussians=lambda camera: None, parameters=lambda: {"means": torch.zeros(1, 3)}, traits=Traits())
     assert judge.viewer_psnrs(model, cameras) == pytest.approx([20.0, 7.9588, 40.0], abs=1e-3)
     assert judge.steer(model) == pytest.approx(-10 * math.log10((0.1**2 + 0.4**2 + 0.01**2) / 3 + VISIBLE_ERROR), abs=1e-3)

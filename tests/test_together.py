@@ -125,7 +125,7 @@ def test_a_check_draws_all_views_in_one_call_if_these_fit(fits, monkeypatch):
     views, drawn = tiny.cameras(4), []
     backend = Together() if fits else ReferenceBackend()
     for each in (backend, ReferenceBackend()):
-        check = Validation(views, [], 1.0, lambda view: torch.full((*view.size, 3), 0.3), Renderer(each, EFFECTS), "area")
+        check = Validation(views, [], 1.0, lambda view: torch.full((*view.size, 3), 0.3), [Renderer(each, EFFECTS)], "area")
         drawn.append(check.steer(tiny.model()))
     assert drawn[0] == drawn[1]
     assert not fits or backend.calls == [4]

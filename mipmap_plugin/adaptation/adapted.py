@@ -48,7 +48,7 @@ class Adapted:
         backend: What renders it.
         effects: How it is rendered: by the filter that its file is for.
         viewers: How each viewer that the file is made for renders it.
-        states: Of the run, and of a conversion before it, which are needed until the model is saved.
+        states: The state files of the run, and of a conversion before it, which are needed until the model is saved.
         adapted_to: The cameras of the base scale that the model was adapted to or selected on.
         cameras: The base's, at its scale.
         judge: The views that nothing was adapted to, with their truth, to measure a file whose format rounds splats; None where there are none.
@@ -181,7 +181,7 @@ def render_model(
 ) -> Rendered:
     """Render a model, its splats first changed by `form`, and report the effects that were simulated. Raises SettingsError.
 
-    `clamped`: of several samples of a pixel.
+    `clamped`: whether each of several samples of a pixel is clamped before their mean is taken.
     """
     matrix = model.traits.exposures.of(camera) if effects.exposure else None
     family = f"family {model.family!r}"

@@ -20,9 +20,9 @@ from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer
 from mipmap_plugin.adaptation.seeing import seeing
 from mipmap_plugin.adaptation.session import Session
+from mipmap_plugin.adaptation.shown import orbited
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.photographs import Photographs
-from mipmap_plugin.adaptation.views import orbited
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import ONE_PIXEL, Camera
 from mipmap_plugin.config import AdaptConfig

@@ -44,7 +44,7 @@ class Stopwatch:
         self._start: float | None = None
 
     def __enter__(self) -> Stopwatch:
-        self._start = self._now()
+        self._start = now(self._device)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -52,10 +52,7 @@ class Stopwatch:
 
     def read(self) -> float:
         """Return the seconds so far, also inside `with`."""
-        return self.seconds if self._start is None else self.seconds + self._now() - self._start
-
-    def _now(self) -> float:
-        return now(self._device)
+        return self.seconds if self._start is None else self.seconds + now(self._device) - self._start
 
 
 def progress(step: int, seconds: float, config: AdaptConfig, before: float = 0.0) -> float:

@@ -1,4 +1,4 @@
-"""When the field of a moving scene is evaluated anew while splats move: once it matters, for it takes many times as long as drawing them."""
+"""When the field of a moving scene is evaluated anew while its splats move: only once it matters, since that takes much longer than drawing them."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from mipmap_plugin.models.base import SplatModel
 
 
 class Following:
-    """Lets a field be evaluated where splats are, once that is no longer nearly where it was evaluated last, and tells what that takes."""
+    """Has the field evaluated anew once splats have moved too far from where it was evaluated last, and tells what the evaluations take."""
 
-    reach = 0.0  # how far splats may move in between, px of the target
-    moments = 0  # of the views
-    rounds = 0.0  # how often splats have moved that far, with the fraction of the last time
+    reach = 0.0  # how far splats may move before the next evaluation, px of the target
+    moments = 0  # the number of moments that the views show
+    rounds = 0.0  # how many times splats have moved that far so far; the fraction is how far they have come since the last time
 
     def __init__(self, base: SplatModel | None = None, views: Sequence[Camera] = (), scale: float = 1.0) -> None:
-        """`views`: of the base's scale. Without a base, or where it need not be followed, nothing is done."""
-        self._whole = 0  # of the rounds
-        self._model: Any = None  # what is followed; it shares with the base what is known of the field
+        """`views`: of the base's scale. Without a base, or with one that need not be followed, nothing is done."""
+        self._whole = 0  # the whole part of `rounds`
+        self._model: Any = None  # the model that is followed; it shares the results of evaluations with the base
         if base is not None and follows(base):
             self._model, pixel = base, float(pixel_size(base.parameters()["means"].detach(), views).median()) / scale
             self._times, self._distance = {view.time for view in views}, self._model.reach(pixel)
@@ -39,12 +39,12 @@ class Following:
 
     @property
     def unknown(self) -> int:
-        """The number of moments of which it is not known how the field moves the splats as they are."""
+        """The number of moments at which the field has not been evaluated for the splats as they are."""
         return sum(not self._model.knows(time) for time in self._times)
 
     @property
     def seconds(self) -> float:
-        """Of all evaluations so far."""
+        """Seconds of all evaluations so far."""
         return self._model.spent[0] if self._model is not None else 0.0
 
     @property
@@ -54,17 +54,17 @@ class Following:
 
 
 def follows(base: SplatModel) -> bool:
-    """Whether a model keeps what its field was evaluated to; one of a third party need not."""
+    """Whether a moving model keeps the results of its field; one of a third party need not."""
     return base.traits.moves and hasattr(base, "follow")
 
 
 def keep_rows(model: SplatModel, rows: Tensor) -> None:
-    """Tell a model that follows its splats which `rows` [M], ascending, are going to be left."""
+    """Tell a model that keeps the results of its field that only these `rows` [M], ascending, are going to be left."""
     if callable(keep := getattr(model, "keep_rows", None)):
         keep(rows)
 
 
 def release(model: SplatModel) -> None:
-    """Let a field be evaluated exactly where the splats are, from now on."""
+    """From now on have the field evaluated exactly where the splats are."""
     if getattr(model, "held", None) is not None:
         model.held = None  # type: ignore[attr-defined]  # of a model that follows its splats

@@ -1,4 +1,4 @@
-"""What renderers show that a file is not steered by: each viewer of several, and a renderer of the base's training, which shows the base itself."""
+"""Renderers besides those that steer a run: each of several viewers, one that draws as the base's training did, and viewers that round positions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.progress import announced
 from mipmap_plugin.splatting.packing import in_two_steps, packed
 
-# Views and splats that are looked at for what a viewer's positions do, and the fraction of the splats that has to be displaced for a word about it.
+# Views and splats by which it is measured how far a viewer that rounds positions displaces splats, and the fraction of displaced ones worth a word.
 LOOKED_AT, SAMPLES, DISPLACED = 4, 1 << 14, 0.5
 
 
@@ -58,8 +58,8 @@ def psnr_per_viewer(validation: Validation, backend: Backend, targets: Mapping[s
     """PSNR (dB) of a model in each viewer on the views that choose among states, where it is made for several; {} for one."""
     if len(targets) == 1:
         return {}
-    first, *further = [Renderer(backend, target) for target in targets.values()]
-    psnrs = replace(validation, render=first, further_renders=further).viewer_psnrs(model, validation.choosing)
+    renders = [Renderer(backend, target) for target in targets.values()]
+    psnrs = replace(validation, renders=renders).viewer_psnrs(model, validation.choosing)
     return dict(zip(targets, psnrs, strict=True))
 
 
@@ -72,7 +72,7 @@ def psnr_as_trained(
     """
     if validation.scale == 1 or not validation.choosing or effects in targets.values():
         return None
-    return replace(validation, render=Renderer(backend, effects), further_renders=[]).viewer_psnrs(base, validation.choosing)[0]
+    return replace(validation, renders=[Renderer(backend, effects)]).viewer_psnrs(base, validation.choosing)[0]
 
 
 def better_as_trained(as_trained: float | None, psnr: float, effects: Effects) -> list[str]:

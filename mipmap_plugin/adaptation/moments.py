@@ -16,7 +16,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.models.base import SplatModel
 
-# Moments at which the states are compared in the end: the field is evaluated anew at each, for each state.
+# The most moments at which states are compared at the end: the field is evaluated anew at each, for each state.
 CHOOSING = 8
 
 # A time that more than this fraction of the views have is always one of the moments: the live view adapts a third of them to what it shows.
@@ -36,9 +36,9 @@ def at_moments(views: Sequence[Camera], most: int | None) -> list[Camera]:
 
 
 def sharing_moments(views: Sequence[Camera], validation: Sequence[Camera], most: int | None) -> tuple[list[Camera], list[Camera], str]:
-    """The views and the validation views, of which every second one steers, at `most` moments or fewer, and a description of these.
+    """The views and the validation views, of which every second one steers, at `most` moments or fewer, and a description of these moments.
 
-    What chooses in the end has moments of its own, since it is held out.
+    The other validation views, which choose among the states at the end, have moments of their own, since they are held out.
     """
     used = at_moments([*views, *validation[::2]], most)
     steering, choosing = used[len(views) :], at_moments(validation[1::2], most and min(most, CHOOSING))
@@ -61,7 +61,7 @@ def at_their_moments(
 def evaluate_moments(base: SplatModel, views: Sequence[Camera], phase: Callable[[str], AbstractContextManager[None]]) -> None:
     """Evaluate the field of a moving scene at each moment of the views, in a `phase` of its own.
 
-    Else the first truth and the first step at each moment would pay for it, and the time that is left be told wrongly.
+    Otherwise the first truth and the first step at each moment would take that long, and the time that is left would be foretold wrongly.
     """
     if follows(base):
         with phase("motion"):

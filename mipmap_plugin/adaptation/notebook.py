@@ -29,7 +29,7 @@ def base_facts(model: SplatModel, cameras: Sequence[Camera], trained: TrainedSca
         "family": model.family,
         "splats": f"{len(model.parameters()['means']):,}",
         "cameras": views,
-        "drawn with": f"{trained.screen_filter}, {trained.eps2d:g} px²",
+        "drawn with": trained.told(),
         "file": "in memory" if model.source is None else str(model.source),
     }
 
@@ -41,7 +41,7 @@ def adapted_facts(model: SplatModel, report: Report) -> dict[str, str]:
     return {
         "family": model.family,
         "scale": f"x{report.scale:g}",
-        "made for": report.viewer or f"what draws with {model.trained.screen_filter}, {model.trained.eps2d:g} px²",
+        "made for": report.viewer or f"what draws with {model.trained.told()}",
         "splats": f"{report.gaussians_before:,} -> {report.gaussians_after:,}",
         **gain,
         "seconds": f"{report.seconds['total']:.1f}, ended by {report.ended_by}",

@@ -14,11 +14,13 @@ from mipmap_plugin.splatting.camera_tensors import CameraTensors
 
 Result = TypeVar("Result")
 
-# Rows of a thread's chunk on a processor, so few that all threads have some of a small scene's; and rows times views that one computes together,
-# in bounded memory: more operations on fewer take longer.
-CHUNK, ROWS_IN_CACHE = 1 << 12, 1 << 14
+# Rows of a chunk for one thread of a processor: so few that even the rows of a small scene occupy all threads.
+CHUNK = 1 << 12
 
-# Rows times views that are computed together elsewhere, and pixels of views that are drawn together: each takes up to half a kilobyte.
+# Rows times views that one operation computes on a processor: more do not fit into its caches, and fewer need more operations, which take longer.
+ROWS_IN_CACHE = 1 << 14
+
+# The same on a GPU, and pixels of the views that are drawn in one call: each takes up to half a kilobyte.
 ROWS_OF_VIEWS = 1 << 21
 
 # Splats plus pixels of a view. Larger views are rendered one after the other: the kernels' own threads are as fast there, and only one view
@@ -68,7 +70,7 @@ def in_chunks(function: Callable[[slice], Result], rows: Tensor) -> list[Result]
 
 
 def in_batches(views: Sequence[Camera], rows: Tensor) -> Iterator[CameraTensors]:
-    """All views, as many at a time as look at the `rows` together: a processor's caches hold few, and a GPU waits for each operation."""
+    """All views, several at a time that look at the `rows` in one operation: few on a processor, whose caches are small, and many on a GPU."""
     most = ROWS_IN_CACHE if rows.device.type == "cpu" else ROWS_OF_VIEWS
     count = max(1, most // max(1, len(rows)))
     for start in range(0, len(views), count):

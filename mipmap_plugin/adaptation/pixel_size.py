@@ -11,30 +11,30 @@ from mipmap_plugin.adaptation.parallel import in_batches, in_chunks
 from mipmap_plugin.backends.cpu import finest_pixels
 from mipmap_plugin.camera import Camera, every_nth
 
-# Number of views from which the area and the blend weight of a splat are computed: doubled, up to a limit, until a splat is in SEEN of them on
-# average. An object needs no more than the least, which would show a third of the splats of a walk through nine rooms.
+# Number of views from which the area and the blend weight of a splat are computed. It starts at LEAST_VIEWS and is doubled, up to MOST_VIEWS, until
+# a splat is in SEEN of them on average. Twelve suffice for an object, but would show only a third of the splats of a walk through nine rooms.
 LEAST_VIEWS, MOST_VIEWS, SEEN = 12, 192, 8.0
 
-# The closest view of a splat is looked for among this many times more: a view costs less there, and few of them miss it (1 to 2.5 dB of captures).
+# The closest view of a splat is looked for among this many times as many views: looking is cheap, and to miss it costs captures 1 to 2.5 dB.
 CLOSEST_OF = 4
 
-# Of a splat that fewer than this fraction of these have in their pictures they easily miss the closest: it is looked for in all views, so many times
-# at most for all such splats together, in a second.
+# If fewer than RARE of these views have a splat in their pictures, the closest view is easily missed. It is then looked for in further views, up to
+# all of them, with at most MOST_LOOKS tests for all such splats together, which take a second.
 RARE, MOST_LOOKS = 1 / 3, 1 << 23
 
-# Splats that are looked for in views.
+# Splats that are counted in views, to tell how many views are enough.
 COUNTED = 1 << 14
 
 
 def enough_views(means: Tensor, views: Sequence[Camera]) -> int:
-    """How many of the views, evenly spread, have enough of the splats at `means` [N, 3] in their pictures."""
+    """How many views, evenly spread over `views`, show enough of the splats at `means` [N, 3]."""
     some, points = every_nth(views, LEAST_VIEWS), means[:: max(1, len(means) // COUNTED)]
     shares = [view.in_picture(view.to_camera(points)).float().mean(1) for view in in_batches(some, points)]
     return views_for(float(torch.cat(shares).mean()) if some else 0.0)
 
 
 def views_for(share: float) -> int:
-    """How many views show enough, where each shows this fraction of the splats."""
+    """How many views are enough if each shows this fraction of the splats."""
     count = LEAST_VIEWS
     while share * count < SEEN and count < MOST_VIEWS:
         count *= 2
@@ -44,7 +44,7 @@ def views_for(share: float) -> int:
 def pixel_size(means: Tensor, views: Sequence[Camera], count: int | None = None) -> Tensor:
     """The size of a pixel at each mean in the closest view that sees it (of all views, if none does): [N] in world units.
 
-    Of many views only some are used, evenly spread: CLOSEST_OF times `count`, or else `enough_views`; and more for what few of these see.
+    Of many views only some are used, evenly spread: CLOSEST_OF times `count`, by default `enough_views`; and more for splats that few of these see.
     """
     some = every_nth(views, _closest_of(means, views, count))
     finest, seeing = _finest(means, some)
@@ -87,7 +87,7 @@ def seen_pixel_size(means: Tensor, views: Sequence[Camera], near: float) -> Tens
 
 
 def _closest_of(means: Tensor, views: Sequence[Camera], count: int | None = None) -> int:
-    """Among how many views the closest is looked for."""
+    """The number of views among which the closest one is looked for."""
     return min(MOST_VIEWS, CLOSEST_OF * (count or enough_views(means, views)))
 
 
@@ -111,7 +111,7 @@ def _finest(means: Tensor, views: Sequence[Camera], near: float = 0.0) -> tuple[
 
 
 def _nearest(means: Tensor, views: Sequence[Camera]) -> Tensor:
-    """The size of a pixel at each mean in the closest of all views, by its distance, for in the camera's own plane a depth is 0: [N]."""
+    """The size of a pixel at each mean in the closest of all views, [N], by the distance, since a depth may be 0 or negative."""
     least = torch.finfo(means.dtype).eps
     batches = in_batches(views, means)
     nearest = [((means - view.center).norm(dim=-1).clamp_min(least) / view.mean_focal).amin(0) for view in batches]

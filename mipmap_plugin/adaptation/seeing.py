@@ -7,11 +7,11 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from mipmap_plugin.adaptation.views import showing
+from mipmap_plugin.adaptation.shown import showing
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera
 
-# Splats that are looked for at most, round by round: nearly every camera sees one of the first, and only those that do not look for more.
+# How many splats are looked for in each round. Nearly every camera sees one of the first round's; only the others look for more.
 SAMPLES = 1 << 8, 1 << 14, 1 << 16
 
 # A camera counts as seeing a splat whose center lies in a frame this many times as large as its picture: splats reach into a picture from beside it.
@@ -21,8 +21,8 @@ LARGER = 2
 def seeing(cameras: Sequence[Camera], means: Tensor, near: float) -> list[Camera]:
     """The cameras that see something of splats at `means` [N, 3], with a warning of how many do not. `near`: the near plane, in world units.
 
-    Of many splats some are looked for, so that a camera that sees a few of a million counts as blind. All cameras stay where none sees anything,
-    or none that the base was trained on.
+    Only some of many splats are looked for, so that a camera which sees a few of a million counts as blind. If none of the training's cameras
+    sees anything, all cameras are kept.
     """
     if len(cameras) < 2:
         return list(cameras)
@@ -37,7 +37,7 @@ def seeing(cameras: Sequence[Camera], means: Tensor, near: float) -> list[Camera
 
 
 def _seeing(frames: Sequence[Camera], means: Tensor, near: float) -> list[Camera]:
-    """The frames with one of the `means` [N, 3] inside, of many evenly chosen ones."""
+    """The frames with one of the `means` [N, 3] inside; only some of many means are looked for, evenly chosen."""
     found = dict[Camera, None]()
     for most in SAMPLES:
         others = [frame for frame in frames if frame not in found]

@@ -27,6 +27,7 @@ from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Qu
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, unrounded, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, simulated, versions
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer, ends_run
+from mipmap_plugin.adaptation.shown import refuse_blind, remarks, showing, too_unlike
 from mipmap_plugin.adaptation.start.candidates import UNMATCHED, StartSearch
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
 from mipmap_plugin.adaptation.start.problem import StartProblem
@@ -35,7 +36,7 @@ from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind, remarks, showing, too_unlike
+from mipmap_plugin.adaptation.views import choose_views, over_band
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Calls
 from mipmap_plugin.camera import ONE_PIXEL, Camera, digest_of, evenly
@@ -81,8 +82,8 @@ class Session:
             self.views = evenly(self.views, config.upsampled_views)
             self.views_note += f", {len(self.views)} of them upsampled"
         truth = PseudoTruth(request.images, scale, config.model_copy(update=COMPARED_WITH_BASE if scale > 1 else {}))
-        first, *further = [Renderer(self.backend, target) for target in self.extremes.values()]
-        self.validation = Validation(steering, choosing, scale, truth, first, config.resize, further)
+        renders = [Renderer(self.backend, target) for target in self.extremes.values()]
+        self.validation = Validation(steering, choosing, scale, truth, renders, config.resize)
 
     def _choose_views(self, cameras: list[Camera]) -> tuple[list[Camera], list[Camera], str]:
         """The views to adapt to, the views for validation, and a description of the former."""
@@ -171,20 +172,20 @@ class Session:
         model = states[best].copy() if getattr(states[best], "shares", False) else states[best]
         return Adapted(model, report, self.backend, self.effects, self.targets, files, used, judge=self.validation.kept())
 
-    def _task(self, student: SplatModel, first: Renderer, further: Sequence[Renderer]) -> Task:
+    def _task(self, student: SplatModel, renders: Sequence[Renderer]) -> Task:
         """What is optimized from `student` on: up to how many splats, and by which of the ways to draw them that the backend has."""
-        growth, targets = self.config.most_growth, [renderer.effects for renderer in (first, *further)]
+        growth, targets = self.config.most_growth, [renderer.effects for renderer in renders]
         return Task(
-            self.views, self.scale, self.truth, first, self.effects.background == (1.0, 1.0, 1.0), self.validation, self.detail,
+            self.views, self.scale, self.truth, renders, self.effects.background == (1.0, 1.0, 1.0), self.validation, self.detail,
             max_splats=self._most_splats if growth is None else min(self._most_splats, int(growth * len(student.parameters()["means"]))),
-            further_renders=further, render_views=views_renderer(self.backend, targets),
-            render_to_step=SteppingRenderer.of(self.backend, targets), follow=Following(self.base, self.views, self.scale),
+            render_views=views_renderer(self.backend, targets), render_to_step=SteppingRenderer.of(self.backend, targets),
+            follow=Following(self.base, self.views, self.scale),
         )  # fmt: skip
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
         """Run Algorithm 1 on `student`, or continue it from the state in `resume`; return the run and what ended it."""
-        first, *further = [Renderer(self.backend, unrounded(target)) for target in self.extremes.values()]
-        task = self._task(student, first, further)
+        renders = [Renderer(self.backend, unrounded(target)) for target in self.extremes.values()]
+        task = self._task(student, renders)
         keeper = StateKeeper(resume, self._fingerprint())
         if not any(target.sh_degree for target in self.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no viewer evaluates view-dependent color, so that these coefficients need no gradient
@@ -197,7 +198,7 @@ class Session:
         def after_step(run: Run) -> bool:
             keeper.save_if_due(run)
             try:
-                return ends_run(observe and observe(run.step, run.watch.seconds, first.of_model(run.student)))
+                return ends_run(observe and observe(run.step, run.watch.seconds, renders[0].of_model(run.student)))
             except KeyboardInterrupt:  # as between two steps
                 keeper.save_and_stop(run)
 
@@ -259,9 +260,8 @@ class Session:
 
     def _fingerprint(self) -> str:
         """A hash of everything that a run depends on, so that a state is never resumed as another run."""
-        base = digest_of_model(self.base)
+        base = digest_of_model(self.base) + ("" if self.finer is None else digest_of_parameters(self.finer.model))
         targets = [asdict(target) for target in self.targets.values()]
-        base += "" if self.finer is None else digest_of_parameters(self.finer.model)
         settings, views = self.config.model_dump(), digest_of(self.views)
         facts = [base, dict(self.request.inputs), self.scale, settings, self.backend.name, asdict(self.base_effects), targets, views]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.parallel import max_threads
+from mipmap_plugin.adaptation.target.base_images import facts
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import ONE_PIXEL, Camera, evenly
@@ -21,17 +22,17 @@ from mipmap_plugin.process.threads import side_by_side
 from mipmap_plugin.scenes.orbits import Orbit, sharp_size, sizes
 from mipmap_plugin.splatting.harmonics import C0
 
-# A view stands in fog, or behind a wall, if more than half of what it shows are splats larger (`sizes`) than FOG of its shorter side. Half of what
-# photographs show are splats of 0.01 to 0.07 in four captures, of such views 0.1 to 4; limits of 0.035 to 0.2 choose as well.
+# A view stands in fog, or behind a wall, if more than half of what it shows are splats larger (`sizes`) than FOG of its shorter side. The median is
+# 0.01 to 0.07 in photographs of four captures, and 0.1 to 4 in such views; limits of 0.035 to 0.2 choose as well.
 FOG = 0.1
 
 # px: the shorter side of the pictures that tell.
 LOOK = 64
 
-# Times as many views as are wanted are tried at most. Of a kitchen that was photographed from one side a quarter are clear.
+# At most so many times as many views are tried as are wanted. Of a kitchen that was photographed from one side a quarter are clear.
 ROUNDS = 4
 
-# Where a time budget allows to look at fewer, any view is taken.
+# If a time budget allows to look at fewer views than this, any are taken.
 LEAST_LOOKS = 16
 
 INSTEAD = "give the scene's cameras (--cameras), or adapt for what you look at (mipmap-plugin view)"
@@ -83,12 +84,12 @@ class ClearViews:
         self._model, self._backend = model, backend
         settings = effects.settings.without_color_rounding()
         self._effects = replace(effects, sh_degree=0, background=(0.0, 0.0, 0.0), settings=settings)
-        self._known: dict[tuple[bytes, tuple[int, int], float], bool] = {}
+        self._known: dict[Hashable, bool] = {}  # by `facts`
 
     @torch.no_grad()
     def __call__(self, views: Sequence[Camera]) -> list[Camera]:
         """Those of the views that see the model clearly. All of a model whose splats have covariances instead of scales."""
-        unknown = [view for view in views if _key(view) not in self._known]
+        unknown = [view for view in views if facts(view) not in self._known]
         if unknown:
             # With the zoom of the views, so that a model shows as many splats as in these.
             small = [replace(view.zoomed(LOOK / min(view.size)), zoom=view.zoom) for view in unknown]
@@ -96,8 +97,8 @@ class ClearViews:
             once = self._model.gaussians(unknown[0]) if self._model.traits.same_for_all_views else None
             threads = max_threads(self._model.parameters()["means"], small[0])
             shown = side_by_side(lambda view: self._is_clear(view, backend, once), small, threads)
-            self._known.update(zip(map(_key, unknown), shown, strict=True))
-        return [view for view in views if self._known[_key(view)]]
+            self._known.update(zip(map(facts, unknown), shown, strict=True))
+        return [view for view in views if self._known[facts(view)]]
 
     def _is_clear(self, view: Camera, backend: Backend, once: Gaussians | None) -> bool:
         splats = self._model.gaussians(view) if once is None else once
@@ -109,10 +110,6 @@ class ClearViews:
         drawn = backend.render(replace(splats, sh=((colors - 0.5) / C0)[:, None]), view, self._effects).image
         fog, all_of_it, _ = drawn.sum((0, 1)).tolist()
         return bool(all_of_it > 0 and fog <= all_of_it / 2)
-
-
-def _key(view: Camera) -> tuple[bytes, tuple[int, int], float]:
-    return view.viewmat.numpy().tobytes(), view.size, view.fx
 
 
 def orbit_of(model: SplatModel, up: tuple[float, float, float] | None, means: Tensor | None = None) -> Orbit:

@@ -1,4 +1,4 @@
-"""Warnings of an adaptation. A warm-up says none: it has one view, of which they are true, and the run that follows has others."""
+"""Warnings of an adaptation. A warm-up gives none, because they would be about its only view, and not about those of the run that follows."""
 
 from __future__ import annotations
 

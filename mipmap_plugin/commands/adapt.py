@@ -222,7 +222,7 @@ def _made_for(report: Report, model: SplatModel) -> str:
     if (trained := model.trained).keeps_filter:
         return f"made for its own project, whose filter it keeps{advice}"
     if trained.screen_filter != "classic":
-        return f"made for renderers that draw as its training did ({trained.screen_filter}, {trained.eps2d:g} px²){advice}"
+        return f"made for renderers that draw as its training did ({trained.told()}){advice}"
     first, then = ("INRIA", "gsplat and nerfstudio") if trained.near_plane == NEAR_PLANE else ("gsplat, nerfstudio", "INRIA")
     return f"made for renderers that draw as 3DGS does ({first}, and {then} where no splat is nearer than {NEAR_PLANE:g} units){advice}"
 

@@ -65,7 +65,7 @@ def inspect(
 
 def _facts(checkpoint: Path, wrapped: Wrapped, given: Path | None, *, whole: bool) -> dict[str, Any]:
     """What is known of a loaded model without a picture, by name. `given`: where its cameras lie; `whole`: with the effects that are off."""
-    from mipmap_plugin.adaptation.views import remarks, too_unlike
+    from mipmap_plugin.adaptation.shown import remarks, too_unlike
     from mipmap_plugin.effects import explain
     from mipmap_plugin.models.base import effects_of
     from mipmap_plugin.models.health import examine, holds_splats
@@ -82,7 +82,7 @@ def _facts(checkpoint: Path, wrapped: Wrapped, given: Path | None, *, whole: boo
         "verdict": _verdict(wrapped, _advice(wrapped, checkpoint, given), told, bool(lost) or health.spoilt(), health.mostly_unseen()),
         "splats": len(gaussians),
         "sh degree": f"{gaussians.used_sh_degree()} in use of {gaussians.sh_degree}",
-        "trained with": f"{wrapped.trained.screen_filter}, {wrapped.trained.eps2d:g} px², background {wrapped.background}",
+        "trained with": f"{wrapped.trained.told()}, background {wrapped.background}",
         "cameras": _seen_by(wrapped, given),
         "effects": [str(effect) for effect in effects if effect.on or whole] + _off(effects, shown=whole),
         "health": told or ["nothing found"],

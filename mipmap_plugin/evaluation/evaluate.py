@@ -163,19 +163,6 @@ def evaluator_of(
     return Evaluator(views, PROTOCOLS[protocol], perceptual, scene.source.name, cells=cells or Cells(), notes=notes)
 
 
-def evaluate(
-    model: Wrapped,
-    scene: Scene,
-    scales: Sequence[float],
-    recipes: Sequence[str],
-    protocol: str,
-    perceptual: Perceptual | None = None,
-    **settings: Any,
-) -> list[Row]:
-    """Return all rows, as `all_rows` does, of a model beside the photographs of its scene. Raises SettingsError."""
-    return all_rows(model, evaluator_of(model, scene, protocol, perceptual), scales, recipes, **settings)
-
-
 def all_rows(model: Wrapped, judge: Evaluator, scales: Sequence[float], recipes: Sequence[str], **settings: Any) -> list[Row]:
     """Return all rows: for each scale the training-free ones, then each recipe twice. Raises SettingsError.
 

@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from torch import Tensor
 
+from mipmap_plugin.adaptation.curve import decibel
 from mipmap_plugin.errors import ShapeError
 
 # Wang et al. 2004, with the window of all splatting papers: an 11 x 11 Gaussian of sigma 1.5.
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
 
-# The PSNR (dB) of identical images, which occur among 8-bit ones, so that means stay finite. It is beyond single precision.
-SAME_DB = 120.0
+# The PSNR (dB) of identical images, which occur among 8-bit ones. It is finite, so that means are.
+SAME_DB = decibel(0.0)
 
 
 def psnr(image: Tensor, truth: Tensor) -> float:
     """PSNR in dB of two images [H, W, 3], both clamped to 0..1; at most SAME_DB, and NaN if one contains NaN. Raises ShapeError."""
     if image.shape != truth.shape:
         raise ShapeError(f"an image {list(image.shape)} cannot be compared with one {list(truth.shape)}")
-    error = float(np.mean((_array(image) - _array(truth)) ** 2))
-    if math.isnan(error):
-        return error
-    return SAME_DB if error == 0 else min(SAME_DB, -10 * math.log10(error))
+    return decibel(float(np.mean((_array(image) - _array(truth)) ** 2)))
 
 
 def ssim(image: Tensor, truth: Tensor) -> float | None:

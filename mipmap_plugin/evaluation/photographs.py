@@ -19,7 +19,7 @@ MOST_BYTES = 2**30
 def kept_photographs(
     scene: Scene, cameras: Sequence[Camera], background: tuple[float, float, float], most_bytes: int = MOST_BYTES
 ) -> list[Callable[[], Tensor]]:
-    """For each camera what returns its photograph as `Scene.image` does, bit for bit, whenever it is asked.
+    """For each camera a function that returns its photograph, bit for bit as `Scene.image` does.
 
     All are read at once, so that a damaged file is found before anything is measured. Raises SceneError.
     """

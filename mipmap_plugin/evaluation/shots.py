@@ -70,10 +70,8 @@ class Recorder:
             self._other.restored(row, report)
 
     def taken(self) -> dict[str, Any]:
-        """What was kept since the last call; without images if nobody watches."""
-        kept = {"shots": self._shots if self._other else [], "reports": self._reports}
-        self._shots, self._reports = [], []
-        return kept
+        """What was kept; without images if nobody watches."""
+        return {"shots": self._shots if self._other else [], "reports": self._reports}
 
     def replay(self, kept: dict[str, Any], camera: Camera) -> None:
         """Tell the other watcher what was kept of a row; `camera`: of the first view."""

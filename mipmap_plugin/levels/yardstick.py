@@ -11,8 +11,8 @@ from torch import Tensor
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import psnr_as_shown
 from mipmap_plugin.adaptation.optimization.validation import WINDOW
+from mipmap_plugin.adaptation.shown import showing
 from mipmap_plugin.adaptation.target.resize import resize
-from mipmap_plugin.adaptation.views import showing
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.limits import derived_seed

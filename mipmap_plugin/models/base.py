@@ -55,6 +55,10 @@ class TrainedScale:
     keeps_filter: bool = False
     up: tuple[float, float, float] | None = None
 
+    def told(self) -> str:
+        """The screen filter in words: "classic, 0.3 px²"."""
+        return f"{self.screen_filter}, {self.eps2d:g} px²"
+
     def drawn_with(self, target: Effects) -> TrainedScale:
         """Of splats that were adapted to another screen filter."""
         return replace(self, screen_filter=target.screen_filter, eps2d=target.eps2d)
@@ -66,7 +70,7 @@ class Traits:
 
     Attributes:
         same_for_all_views: Rows are splats, the same for every camera: the model has `rebuild`, and splats may be merged.
-        plain: The parameters are those of 3DGS, activated as there, so that a backend may move them itself (`Backend.render_to_step`).
+        plain: The parameters are those of 3DGS, activated as there, so that a backend may move them itself (`Backend.stepper`).
         moves: Gaussians depend on the camera's time.
         filtered: Each splat has a 3D filter, which only the original project's viewer applies: the model has `fused` and `bare`.
         placed: Trained in a coordinate frame or at an image size of its own: the model has `as_trained`.
@@ -89,8 +93,11 @@ class Traits:
     thins: bool = False
 
 
+# The parameters of 3DGS.
+OF_3DGS = ("means", "scales", "quats", "opacities", "sh0", "shN")
+
 # Allowed names of parameters, each with a learning rate of its own (`config.LearningRates`). The first is required.
-PARAMETERS = ("means", "scales", "quats", "opacities", "sh0", "shN", "offsets", "features", CARRIED)
+PARAMETERS = (*OF_3DGS, "offsets", "features", CARRIED)
 
 
 @runtime_checkable  # for tools that check arguments by their annotations, such as pydantic

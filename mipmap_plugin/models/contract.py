@@ -18,6 +18,7 @@ from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import (
     CARRIED,
+    OF_3DGS,
     PARAMETERS,
     Filtered,
     Placed,
@@ -35,9 +36,6 @@ from mipmap_plugin.splatting.eigen import by_axes
 
 # What a model with a trait provides beside what every model does.
 PROMISED = {"same_for_all_views": Rebuilt, "placed": Placed, "thins": Thinned, "filtered": Filtered}
-
-# The parameters of a model with the trait `plain`.
-PLAIN = ("means", "scales", "quats", "opacities", "sh0", "shN")
 
 # The types of a model's attributes.
 TYPES: dict[str, tuple[type, ...]] = {
@@ -89,7 +87,7 @@ def _wrong_parameters(model: SplatModel) -> list[str]:
         return no_dictionary
     wrong = ["the parameter 'means'"] * ("means" not in parameters)
     wrong += [f"a name of PARAMETERS for {name!r}" for name in parameters if name not in PARAMETERS]
-    wrong += [f"the parameters {', '.join(PLAIN)}, which its trait `plain` promises"] * (model.traits.plain and {*parameters} != {*PLAIN})
+    wrong += [f"the parameters {', '.join(OF_3DGS)}, which its trait `plain` promises"] * (model.traits.plain and {*parameters} != {*OF_3DGS})
     if others := [name for name, tensor in {**parameters, **shared}.items() if not isinstance(tensor, Tensor)]:
         wrong.append(f"tensors as the parameters {', '.join(map(str, others))}")
     rows = {name: len(tensor) if tensor.ndim else "single" for name, tensor in parameters.items()} if not wrong else {}

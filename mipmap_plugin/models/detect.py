@@ -13,7 +13,7 @@ from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import OF_SPLATS, Family, Files, Match
 from mipmap_plugin.models.places import PARTS, REPORT
-from mipmap_plugin.models.zipped_folder import opened, told_of_archives
+from mipmap_plugin.models.zipped_folder import opened, retold, told
 
 # Suffixes of files of splats besides PLY, and of photographs.
 EXCHANGED, PHOTOGRAPHS = (".spz", ".sog", ".splat", ".ksplat", ".glb", ".gltf"), (".jpg", ".jpeg", ".png")
@@ -49,14 +49,14 @@ def detect(path: str | Path, *, iteration: int | None = None) -> Checkpoint:
     if path.is_dir():
         return _detect_folder(path, iteration)
     if (folder := opened(path)) != path:
-        with told_of_archives():
+        with retold(told):
             return _detect_folder(folder, iteration)
     if iteration is not None and path.exists():
         raise CheckpointError(f"{path} is a file and has no iterations; give its model folder to choose iteration {iteration}")
     return _recognize(path)[0]
 
 
-def detect_as(path: str | Path, families: tuple[str, ...], *, iteration: int | None = None) -> Checkpoint:
+def detect_as(path: str | Path, families: tuple[str, ...], *, iteration: int | None) -> Checkpoint:
     """As `detect`, but raises CheckpointError for any family not in `families`."""
     checkpoint = detect(path, iteration=iteration)
     if checkpoint.family in families:

@@ -134,7 +134,7 @@ def torch_file(*words: str, sure: float = CERTAIN, trouble: str = "") -> Recogni
     return lambda files: Match(sure, f"holds {words[0]}", trouble.format(path=files.path)) if files.words(*words) else None
 
 
-def holds_splats(files: Files) -> Match | None:
+def gsplat(files: Files) -> Match | None:
     """Recognize gsplat's checkpoints: torch files whose splats are a dictionary of that name."""
     return Match(CERTAIN, "holds splats") if files.strings("splats") else None
 
@@ -159,7 +159,7 @@ BUILT_IN = (
     family("octree", "Octree-GS", anchors("octree"), load=f"{LOADERS}.anchors.octree:load_octree", before=FLAT_OR_FILTERED),
     family("deformable", "Deformable 3D Gaussians", deformable, load=f"{LOADERS}.moving.deformable:load_deformable"),
     family("4dgs", "4D Gaussians", hexplane, load=f"{LOADERS}.moving.hexplane:load_hexplane", before=("deformable", "sc-gs")),
-    family("gsplat", "gsplat", holds_splats, load=f"{LOADERS}.gsplat.model:load_gsplat", before=("splatfacto",), place=GSPLAT),
+    family("gsplat", "gsplat", gsplat, load=f"{LOADERS}.gsplat.model:load_gsplat", before=("splatfacto",), place=GSPLAT),
     family(
         "splatfacto", "splatfacto (nerfstudio)", torch_file("pipeline", "gauss_params"),
         load=f"{LOADERS}.splatfacto:load_splatfacto", place=SPLATFACTO,

@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.errors import CheckpointError
-from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.models.base import OF_3DGS, SplatModel
 
-Model = TypeVar("Model", bound="HasRows")
-Read = TypeVar("Read", bound="IsRead")
+Model = TypeVar("Model", bound="IsRead")
 
 
 def units(length: float, digits: int) -> str:
@@ -24,19 +23,13 @@ def units(length: float, digits: int) -> str:
     return f"{length:.{digits}g}" if length < 10**digits - 0.5 else f"{length:,.0f}"
 
 
-class HasRows(Protocol):
-    """A model whose rows can be removed."""
-
-    notes: list[str]
+class IsRead(SplatModel, Protocol):
+    """A model of splats that is checked when it is read."""
 
     def keep_rows(self: Model, keep: Tensor) -> Model:
         """A new model of the rows where `keep` [N] is True."""
 
-
-class IsRead(HasRows, SplatModel, Protocol):
-    """A model of splats that is checked when it is read."""
-
-    def noted(self: Read, note: str) -> Read:
+    def noted(self: Model, note: str) -> Model:
         """The same model with one more note."""
 
 
@@ -155,7 +148,7 @@ def coarse(rounded: int, splats: int, step: float) -> str:
 
 def holds_splats(model: SplatModel) -> bool:
     """Whether the rows of a model's parameters are splats, which `examine` counts; those of anchors, for one, are not."""
-    return {"means", "scales", "quats", "opacities", "sh0", "shN"} <= model.parameters().keys()
+    return set(OF_3DGS) <= model.parameters().keys()
 
 
 def examine(model: SplatModel) -> Health:
@@ -170,8 +163,8 @@ def examine(model: SplatModel) -> Health:
         thin = thin[:, ~thin.all(0)]
     return Health(
         splats=len(scales),
-        nan={name: _rows_where(torch.isnan, tensor) for name, tensor in raw.items()},
-        infinite={name: _rows_where(torch.isinf, tensor) for name, tensor in raw.items()},
+        nan={name: rows_where(torch.isnan, tensor) for name, tensor in raw.items()},
+        infinite={name: rows_where(torch.isinf, tensor) for name, tensor in raw.items()},
         zero_quaternions=int((raw["quats"] == 0).all(1).sum()),
         extent=extent,
         huge=_rows(scales > extent) if extent > 0 else 0,
@@ -208,7 +201,7 @@ def drop(model: Model, mask: Tensor, why: str, source: Path | str | None) -> Mod
     return kept
 
 
-def without_invalid(model: Read) -> Read:
+def without_invalid(model: Model) -> Model:
     """The model without splats that are not finite once activated, with a note. Raises CheckpointError if none or few are left (`refuse_few`).
 
     Once for each model it warns of what is doubtful (`Health.doubts`), such as positions that float32 does not hold: a file of doubles loses them
@@ -258,7 +251,7 @@ def _invalid(raw: dict[str, Tensor], scales: Tensor, opacities: Tensor) -> Tenso
     return ~valid
 
 
-def _rows_where(test: Callable[[Tensor], Tensor], values: Tensor) -> int:
+def rows_where(test: Callable[[Tensor], Tensor], values: Tensor) -> int:
     """The number of rows with a value for which `test` is True."""
     return sum(_rows(test(part)) for part in values.split(CHUNK))
 

@@ -46,13 +46,12 @@ class Host(Protocol):
 
 
 def as_file(name: str) -> str:
-    """What the names of views are sorted by, which lack their endings: the files `a-1.jpg` and `a (2).jpg` come before `a.jpg`."""
+    """The key that sorts names of views, which lack the files' endings, as the files are sorted: `a-1.jpg` and `a (2).jpg` come before `a.jpg`."""
     return f"{name}."
 
 
 def held_out(cameras: Sequence[Camera], tests: Collection[int], numbers: Sequence[int] = ()) -> list[Camera]:
-    """The cameras, of which those at the places `tests` in the order of their `numbers`, or else of their files' names, are for testing, and all
-    others for training."""
+    """The cameras with their splits: those at the places `tests`, in the order of their `numbers` or else of their files' names, are for testing."""
     ordered = sorted(range(len(cameras)), key=lambda place: numbers[place] if numbers else as_file(cameras[place].name))
     chosen = {ordered[place] for place in tests}
     return [replace(camera, split="test" if number in chosen else "train") for number, camera in enumerate(cameras)]

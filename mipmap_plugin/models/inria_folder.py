@@ -70,7 +70,7 @@ def _screen_filter(options: dict[str, Any], tag: str | None) -> tuple[str, float
     return tag or TrainedScale.screen_filter, TrainedScale.eps2d
 
 
-def companion_notes(options: dict[str, Any], sh_degree: int, exposures: Exposures, taken_as_classic: bool = False) -> list[str]:
+def companion_notes(options: dict[str, Any], sh_degree: int, exposures: Exposures, taken_as_classic: bool) -> list[str]:
     """Remarks on unusual options, in sentences. `taken_as_classic`: no file names the screen filter."""
     notes = []
     if options.get("sh_degree", sh_degree) != sh_degree:

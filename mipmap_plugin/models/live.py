@@ -19,7 +19,7 @@ from mipmap_plugin.models.anchors.scaffold import scaffold_in_memory
 from mipmap_plugin.models.base import CARRIED, OPACITY_ROUNDING, SplatModel, TrainedScale, tensors_of
 from mipmap_plugin.models.contract import lacking
 from mipmap_plugin.models.gsplat import model as gsplat
-from mipmap_plugin.models.health import without_invalid
+from mipmap_plugin.models.health import rows_where, without_invalid
 from mipmap_plugin.models.surfels import FLAT, SurfelModel, flat_trained
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 
@@ -145,7 +145,7 @@ def _checked(model: SplatModel) -> SplatModel:
     if isinstance(model, VanillaModel):
         return without_invalid(model)
     for name, tensor in model.parameters().items():
-        if rows := int(tensor.detach().isnan().flatten(1).any(1).sum() if tensor.dim() > 1 else tensor.detach().isnan().sum()):
+        if rows := rows_where(torch.isnan, tensor.detach()):
             raise SettingsError(f"this {_name(model)} holds a NaN in {name} of {rows:,} of its {len(tensor):,} rows; drop these first")
     return model
 

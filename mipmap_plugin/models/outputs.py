@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -16,6 +17,7 @@ from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_glb, is_written, refuse_as_folder, refuse_exchange
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.health import rows_where
 from mipmap_plugin.models.places import CONVERTED, PARTS, REPORT, STATE
 
 # What is written into a model folder, of all families.
@@ -23,9 +25,6 @@ WRITTEN = (
     "cfg_args", "cameras.json", "input.ply", "exposure.json", "cfg.yml", "config.yml", "dataparser_transforms.json", "ckpts/*.pt",
     "nerfstudio_models/*.ckpt", "deform/*/deform.pth", "point_cloud/*/point_cloud.ply", "point_cloud/*/*.pt", "point_cloud/*/*.pth", f"*{REPORT}",
 )  # fmt: skip
-
-# Rows that are checked together, so that there is no second copy of all.
-CHUNK = 1 << 17
 
 # World units: SPZ, as splat-transform writes it, has 24 bits for a coordinate, 12 of them for parts of a unit. Splats farther away would be put 4,096
 # units elsewhere without a word.
@@ -72,7 +71,7 @@ def refuse_format(path: Path, trained: TrainedScale, means: Tensor) -> None:
     if not len(means):
         raise SettingsError(f"{path}: there are no splats to write, which this format needs; give a .ply")
     if trained.keeps_filter:
-        own = f"the filter of their own project ({trained.screen_filter}, {trained.eps2d:g} px²)"
+        own = f"the filter of their own project ({trained.told()})"
         raise SettingsError(f"{path}: these splats need {own}; give a .ply or a folder, or adapt for a viewer if the family allows it")
     if not is_glb(path):
         refuse_exchange(path)
@@ -87,7 +86,7 @@ def refuse_far(path: Path, means: Tensor, instead: str) -> None:
         raise SettingsError(f"{path}: {far:,} of {len(means):,} splats {where}; remove them, move or shrink the scene, or {instead}")
 
 
-def without_place(path: Path, extras: Iterable[str], sh_degree: int = 0) -> str:
+def without_place(path: Path, extras: Iterable[str], sh_degree: int) -> str:
     """What the file at `path` will not hold, in a sentence: columns that 3DGS does not define, high SH bands; "" if it holds everything."""
     if not is_written(path):
         return ""
@@ -102,8 +101,7 @@ def drawn_otherwise(path: Path, trained: TrainedScale) -> str:
     """That many viewers of the exchange format of `path` do not draw splats as they were trained, in a sentence; "" if they do, or of a .ply."""
     if trained.screen_filter == TrainedScale.screen_filter or not is_written(path):
         return ""
-    own = f"{trained.screen_filter}, {trained.eps2d:g} px²"
-    right = f"the file is right where splats are drawn as in training ({own})"
+    right = f"the file is right where splats are drawn as in training ({trained.told()})"
     return f"{right}, which not all viewers of {_ending(path)} do; for others adapt for a viewer"
 
 
@@ -121,7 +119,7 @@ def finite(parameters: Mapping[str, Tensor], most: float) -> dict[str, Tensor]:
         if name in cleaned:
             cleaned[name] = cleaned[name].nan_to_num(nan=torch.nan, posinf=high, neginf=low)
     for name, value in {**cleaned, "lengths": cleaned["scales"].exp()}.items():
-        if rows := sum(_wrong_rows(part, torch.inf if name in ("opacities", "quats") else most) for part in value.split(CHUNK)):
+        if rows := rows_where(partial(_is_wrong, most=torch.inf if name in ("opacities", "quats") else most), value):
             raise SettingsError(
                 f"{rows:,} of {len(value):,} rows hold a NaN, an infinity or more than {most:g} in {name}, so nothing is saved;"
                 " adapt less boldly, or to another scale"
@@ -129,10 +127,9 @@ def finite(parameters: Mapping[str, Tensor], most: float) -> dict[str, Tensor]:
     return cleaned
 
 
-def _wrong_rows(values: Tensor, most: float) -> int:
-    """The number of rows with a NaN, an infinity or a number above `most`."""
-    right = values.isfinite() if most == torch.inf else values.abs() <= most  # False for NaN
-    return len(values) - int(right.flatten(1).all(1).sum() if right.dim() > 1 else right.sum())
+def _is_wrong(values: Tensor, most: float) -> Tensor:
+    """Where values are NaN, infinite or above `most`."""
+    return ~(values.isfinite() & (values.abs() <= most))
 
 
 def _belongs(name: str, source: str) -> bool:

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from mipmap_plugin.errors import ShapeError
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.base import OF_3DGS
 from mipmap_plugin.models.columns import OPACITY_MARGIN, SH_DEGREES
 
 # World units: about the shortest length whose square is a normal float32. Its logarithm is finite, so it can be optimized.
@@ -15,7 +16,7 @@ MIN_SCALE = 1e-18
 
 def check(parameters: dict[str, Tensor]) -> None:
     """Raise ShapeError unless the parameters are those of 3DGS, in shapes that fit together."""
-    if set(parameters) != {"means", "scales", "quats", "opacities", "sh0", "shN"}:
+    if set(parameters) != set(OF_3DGS):
         raise ShapeError(f"parameters: expected means, scales, quats, opacities, sh0 and shN, got {', '.join(parameters)}")
     n = len(parameters["means"])
     bands = parameters["shN"].shape[1] if parameters["shN"].dim() == 3 else 0

@@ -143,9 +143,9 @@ def load_splatfacto(path: str | Path, *, iteration: int | None = None) -> Vanill
     step, comments = step_and_comments(content, checkpoint.path)
     host = SplatfactoHost(checkpoint.path, checkpoint.folder, step, options)
     origin = Origin(checkpoint.path, sha256(checkpoint.path), checkpoint.folder, checkpoint.iteration, comments, host=host)
-    antialiased = "antialiased" if options.get("rasterize_mode") == "antialiased" else "classic"
+    screen_filter = "antialiased" if options.get("rasterize_mode") == "antialiased" else "classic"
     background = BACKGROUNDS.get(str(options.get("background_color")))
-    trained = as_tagged(TrainedScale(antialiased, background=background, near_plane=NEAR_PLANE, up=UP), comments)
+    trained = as_tagged(TrainedScale(screen_filter, background=background, near_plane=NEAR_PLANE, up=UP), comments)
     try:
         model = VanillaModel(to_parameters(stored), trained, origin, _unusual_options(content["pipeline"], options))
     except (ShapeError, RuntimeError, IndexError) as error:  # what torch raises for a tensor with too few axes

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -79,9 +78,9 @@ def load_surfels(path: str | Path, *, iteration: int | None = None) -> SurfelMod
     return model
 
 
-def flat_trained(trained: TrainedScale, **changes: Any) -> TrainedScale:
-    """`trained` with the screen filter of surfels, and `changes`."""
-    return replace(trained, screen_filter=SURFEL, eps2d=LOW_PASS, keeps_filter=True, **changes)
+def flat_trained(trained: TrainedScale) -> TrainedScale:
+    """`trained` with the screen filter of surfels."""
+    return replace(trained, screen_filter=SURFEL, eps2d=LOW_PASS, keeps_filter=True)
 
 
 def flattened(gaussians: Gaussians) -> Gaussians:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,20 +13,14 @@ from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.families import find_family
 from mipmap_plugin.models.reading import read_splats
 from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.models.zipped_folder import retold
 
 
 def load_zipped(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
     """Load the 3DGS PLY in a zip archive that holds nothing else. Raises CheckpointError."""
     file = detect(path, iteration=iteration).path
-    with unpacked(file) as ply, warnings.catch_warnings(record=True) as doubts:
-        warnings.simplefilter("always")
-        try:
-            model = _load(ply, file)
-        except CheckpointError as error:
-            raise CheckpointError(_told(error, ply, file)) from error
-    for doubt in doubts:
-        warnings.warn(_told(doubt.message, ply, file), doubt.category, stacklevel=2)
-    return model.with_source(file)
+    with unpacked(file) as ply, retold(lambda words: str(words).replace(str(ply), f"the PLY in {file}")):  # and not of the temporary one
+        return _load(ply, file).with_source(file)
 
 
 def _load(ply: Path, file: Path) -> VanillaModel:
@@ -37,8 +30,3 @@ def _load(ply: Path, file: Path) -> VanillaModel:
     if "scale" in (provenance_of(read_header(ply).comments) or {}):
         raise CheckpointError(f"{file} holds a file that was adapted; unpack it, so that its scale is read too")
     return read_splats(replace(checkpoint, folder=None), VanillaModel)
-
-
-def _told(words: object, ply: Path, file: Path) -> str:
-    """What is said of the temporary PLY, as said of that in the archive."""
-    return str(words).replace(str(ply), f"the PLY in {file}")

@@ -7,7 +7,7 @@ import tempfile
 import threading
 import warnings
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
@@ -37,20 +37,20 @@ def opened(path: Path) -> Path:
 
 
 @contextmanager
-def told_of_archives() -> Iterator[None]:
-    """Tell errors (CheckpointError) and warnings of this block about unpacked folders as of the archives."""
+def retold(retell: Callable[[object], str]) -> Iterator[None]:
+    """Raise the errors (CheckpointError) of this block and repeat its warnings with the words that `retell` makes of them."""
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always")
         try:
             yield
         except CheckpointError as error:
-            raise CheckpointError(told(error)) from error
+            raise CheckpointError(retell(error)) from error
     for doubt in doubts:
-        warnings.warn(told(doubt.message), doubt.category, stacklevel=3)
+        warnings.warn(retell(doubt.message), doubt.category, stacklevel=3)
 
 
 def told(words: object) -> str:
-    """What is said of files in unpacked folders, as said of the archives."""
+    """What is said of files in unpacked folders, as said of the archives (`retold`)."""
     text = str(words)
     for (path, *_), (_, folder) in list(_OPENED.items()):
         text = text.replace(str(folder), str(path))

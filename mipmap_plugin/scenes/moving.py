@@ -42,7 +42,7 @@ def is_hypernerf(path: Path) -> bool:
     return (path / "dataset.json").is_file() and (path / "camera").is_dir()
 
 
-def read_dynerf(path: Path, cfg: dict[str, Any] | None = None) -> Scene:
+def read_dynerf(path: Path, cfg: dict[str, Any] | None) -> Scene:
     """The cameras of all videos, the first for testing. Training cameras take turns, so that together they have one view per frame. Frames
     are in cam<NN>/images, if they were extracted.
 
@@ -71,7 +71,7 @@ def read_dynerf(path: Path, cfg: dict[str, Any] | None = None) -> Scene:
     return Scene(tuple(cameras), images, path, notes, as_4dgaussians=True)
 
 
-def read_hypernerf(path: Path, cfg: dict[str, Any] | None = None) -> Scene:
+def read_hypernerf(path: Path, cfg: dict[str, Any] | None) -> Scene:
     """The training and test views of a capture as 4DGaussians reads them, at half its size.
 
     With the cfg_args (`cfg`) of Deformable 3D Gaussians, as that does: from the scene's center, in its scale, by another time, and in a size

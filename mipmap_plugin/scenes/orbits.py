@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -16,21 +17,22 @@ from mipmap_plugin.gaussians import Gaussians
 
 ORBIT_FOV = math.radians(50)  # along the shorter side: a normal lens
 
-# Elevations of an orbit's views, degrees: where the vertical is guessed, typical of handheld cameras; where somebody says it, what people look at
-# an object from. From 10 to 50 there too, lego and chair at x1/4 gain 0.5 and 0.9 dB between 20 and 50, and lose 3.6 above and 1.5 below.
+# Elevations of an orbit's views, degrees. HANDHELD, where the vertical is guessed: those of handheld cameras. ABOVE, where somebody says what is up:
+# those from which people look at an object. With HANDHELD there, too, lego and chair at x1/4 gain 0.5 and 0.9 dB in views from 20 to 50 degrees, but
+# lose 3.6 dB in higher and 1.5 in lower ones.
 HANDHELD, ABOVE, ALL = (10.0, 50.0), (-10.0, 80.0), (-90.0, 90.0)
 
 # Fraction of the splats that an orbit frames; the farthest tenth are mostly floaters and background.
 FRAMED = 0.9
 
-# An object by itself has none of these: WHOLE of its splats lie within TIGHT times the radius that frames most. Of eleven objects cut out of captures
-# or rendered it is at most 1.3 times (a guitar lost its head by FRAMED, a statue its upper half), of seven captures at least 1.5.
+# An object by itself has neither: WHOLE of its splats lie within TIGHT times the radius that frames FRAMED of them. For eleven objects, rendered or
+# cut out of captures, the ratio is at most 1.3 (framed by FRAMED a guitar lost its head, a statue its upper half), for seven captures at least 1.5.
 WHOLE, TIGHT = 0.995, 1.4
 
-# Where a capture was seen from is guessed by its splats: of those that can be seen in its inner half, half are smaller than SHARP_PX in the pictures
-# that it was trained on (1.4 to 4.4 px in five captures). Half of the views are as far away as that is so in theirs, whose focal length is
-# SHARP_FOCAL px, the others NEARER, but none is within the middle quarter of the splats. By views that frame the splats, from up to 15 times as far
-# away as the cameras, a bird and flowers are worse than their bases, seen from where they were photographed.
+# From where a capture was photographed is guessed by its splats: in the photographs, the median size of those in its inner half that can be seen is
+# about SHARP_PX (1.4 to 4.4 px in five captures). Half of an orbit's views are at the distance at which pictures of the focal length SHARP_FOCAL px
+# show this size, the others at NEARER of it, but none is within the MIDDLE of the splats. Adapted to views that frame all splats, from up to 15 times
+# as far away as the cameras, a bird and flowers look worse than their bases from where they were photographed.
 INNER, SHARP_PX, NEARER, MIDDLE = 1 / 2, 2.0, 1 / 2, 1 / 4
 SHARP_FOCAL = 400 / math.tan(ORBIT_FOV / 2)  # of pictures of 800 px
 SEEN_OPACITY = 0.1
@@ -102,7 +104,8 @@ class Orbit:
         guessed = self.up is not None and not self.said
         elevations = HANDHELD if guessed else ABOVE if self.said else ALL
         directions = (_sky_directions if guessed else _spiral)(vertical, elevations, count, generator)
-        # Two and two: by a part of the turn all near ones would be on one side, and every other view is in the same half of the checks.
+        # Two far, two near: if all views of one part of the turn were near, these would be on one side only, and if every other view were, all of
+        # them would be in the same half of the validation views.
         far = [self.distance if i // 2 % 2 == 0 else self.nearest or self.distance for i in range(count)]
         return [_looking_at(center, center + far[i] * way, vertical, size, f"orbit_{first + i:04d}") for i, way in enumerate(directions)]
 
@@ -115,10 +118,8 @@ def orbit(
     Suitable for objects: the positions of the cameras of an unbounded scene do not follow from its splats. Raises SettingsError
     without splats or views.
     """
-    if isinstance(means, Gaussians):
-        gaussians = means
-        return Orbit.around(gaussians.means, up, lambda: sharp_size(gaussians)).views(size, count, generator)
-    return Orbit.around(means, up).views(size, count, generator)
+    around = Orbit.around(means.means, up, partial(sharp_size, means)) if isinstance(means, Gaussians) else Orbit.around(means, up)
+    return around.views(size, count, generator)
 
 
 def frame(means: Tensor) -> tuple[Tensor, float, bool]:
@@ -133,9 +134,9 @@ def frame(means: Tensor) -> tuple[Tensor, float, bool]:
 
 
 def sharp_size(gaussians: Gaussians) -> float:
-    """The median size (`sizes`), in world units, of the splats in the inner half that can be seen: farther out they are larger.
+    """The median size (`sizes`), in world units, of the visible splats in the inner half of a scene, since splats farther out are larger.
 
-    Infinite where none can be seen, or shapes are not scales.
+    Infinite if no splat is visible, or if the splats have covariances instead of scales.
     """
     seen = (gaussians.opacities >= SEEN_OPACITY) & gaussians.scales.isfinite().all(dim=1) & gaussians.means.isfinite().all(dim=1)
     if gaussians.covariances is not None or not seen.any():

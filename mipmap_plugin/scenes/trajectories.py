@@ -13,29 +13,29 @@ from mipmap_plugin.camera import Camera, viewmat_of
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.scenes.orbits import Orbit
 
-# A generated view lies between a camera and one of its NEIGHBORS nearest, or beyond either end by up to this fraction of the way: with fewer, and
-# none beyond, views fill the gaps between cameras poorly.
+# A generated view lies between a camera and one of its NEIGHBORS nearest ones, or beyond either of them by up to BEYOND of the way. With fewer
+# neighbors, and nothing beyond, views fill the gaps between cameras poorly.
 NEIGHBORS = 16
 BEYOND = 0.25
 
-# Cameras beyond a gap of so many times the distance before it are of another part of the capture, where nobody was on the way; but for the first
-# few, which may be those of a rig.
+# Of a camera's neighbors, by distance, those after a gap are of another part of the capture, and nobody was on the way there. A gap is a distance GAP
+# times as large as the one before it; among the first RIG neighbors, which may be the cameras of a rig, there is none.
 GAP, RIG = 4.0, 4
 
-# Fraction of the distance to another place within which cameras are in one place but for rounding.
+# Cameras whose distance is a smaller fraction of that to another place are in the same place, but for rounding.
 SAME_PLACE = 1e-6
 
-# Of the coordinates of splats and cameras, which checkpoints store in single precision.
+# The relative rounding error of coordinates of splats and cameras, which checkpoints store in single precision.
 ROUNDING = torch.finfo(torch.float32).eps
 
 # Candidates per generated view: keeping those that fill gaps gains 0.5 dB on lego's test views at x1/8.
 CANDIDATES = 16
 
-# Sine of the angle below which the intersection of two lines of sight is undefined.
+# The sine of the angle between two lines of sight below which their intersection counts as undefined.
 PARALLEL = 1e-6
 
-# How far people move before a scene that a lone camera saw, as a fraction of the distance to its middle. Files for x1/4 gain 4 to 10 dB so far to
-# its side by such views, and lose up to 0.7 at the camera's own place.
+# How far people move in front of a scene that a single camera saw, as a fraction of the distance to its middle. Files for x1/4 that are adapted to
+# such views gain 4 to 10 dB when they are seen from there, and lose up to 0.7 dB at the camera's own place.
 SWAY = 0.1
 
 # Cameras whose directions differ more see different content, and views halfway between them look where no camera did.

@@ -145,7 +145,7 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
         stated = _stated_size(values, where)
         actual = image_size(image) if image else stated  # the image may have been shrunk since
         if actual:
-            name = image.stem if image else _stem(listed.replace("\\", "/").rsplit("/", 1)[-1])
+            name = image.stem if image else _stem(_place(listed).name)
             split = split if trained is None else "train" if _place(listed) in trained else "test"
             if stated and image:
                 refuse_other_shape(stated, image, f"{where} ({name})")

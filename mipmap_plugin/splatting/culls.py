@@ -14,6 +14,9 @@ from torch import Tensor
 
 from mipmap_plugin.render_settings import RenderSettings
 
+# xx, xy, yy and det, [N] each, px² and px⁴: the covariances of splats on the image.
+Shape = tuple[Tensor, Tensor, Tensor, Tensor]
+
 STEEPNESS = 4.0
 
 # What stands in place of a level splat's xy, over the least spread: 1 px² over the root of 0.1 px⁴ in vk_gaussian_splatting. As a ratio it holds for
@@ -21,10 +24,10 @@ STEEPNESS = 4.0
 ASIDE = 10**0.5
 
 
-def gate(shape: tuple[Tensor, Tensor, Tensor, Tensor], opacities: Tensor, settings: RenderSettings) -> Tensor:
+def gate(shape: Shape, opacities: Tensor, settings: RenderSettings) -> Tensor:
     """1 where a splat is drawn and 0 where it is culled, [N], with the gradient of the smooth step.
 
-    `shape`: (xx, xy, yy, det) [N] of the dilated covariances, px² and px⁴. `opacities` [N]: before any compensation.
+    `shape`: dilated. `opacities` [N]: before any compensation.
     """
     xx, _, yy, det = shape
     ratios = []
@@ -43,7 +46,7 @@ def gate(shape: tuple[Tensor, Tensor, Tensor, Tensor], opacities: Tensor, settin
     return (least >= 1).to(smooth) + smooth - smooth.detach()
 
 
-def spread(shape: tuple[Tensor, Tensor, Tensor, Tensor]) -> Tensor:
+def spread(shape: Shape) -> Tensor:
     """Half the difference of the variances along a splat's two axes, [N] px²."""
     half, xy = (shape[0] - shape[2]) / 2, shape[1]
     is_round = (half == 0) & (xy == 0)
@@ -51,9 +54,7 @@ def spread(shape: tuple[Tensor, Tensor, Tensor, Tensor]) -> Tensor:
     return torch.where(is_round, 0.0, torch.hypot(torch.where(is_round, 1.0, half), xy))
 
 
-def stretched(
-    shape: tuple[Tensor, Tensor, Tensor, Tensor], drawn: Tensor, least: float, level: float = 0.0
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def stretched(shape: Shape, drawn: Tensor, least: float, level: float = 0.0) -> Shape:
     """Stretch the `drawn` [N] splats whose `spread` is below `least` px² until it is `least`.
 
     As in GaussianSplats3D (SplatMaterial3D): the direction of the longer axis is (xy, mean + least - xx), which is an eigenvector
@@ -71,7 +72,7 @@ def stretched(
     return tuple(torch.where(changed, new, old) for new, old in zip(stretch, shape, strict=True))  # type: ignore[return-value]
 
 
-def limited(shape: tuple[Tensor, Tensor, Tensor, Tensor], most: float, whole: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def limited(shape: Shape, most: float, whole: bool) -> Shape:
     """Clamp the variances along each splat's axes to `most` px². `whole`: shrink the splat before, until its variances along x and y fit.
 
     A change of a matrix M's eigenvalues that keeps its eigenvectors is a·M + b·1 (Cayley and Hamilton). For variances
@@ -89,7 +90,7 @@ def limited(shape: tuple[Tensor, Tensor, Tensor, Tensor], most: float, whole: bo
     return tuple(torch.where(changed, limit, old) for limit, old in zip(new, shape, strict=True))  # type: ignore[return-value]
 
 
-def _shrunk(shape: tuple[Tensor, Tensor, Tensor, Tensor], most: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _shrunk(shape: Shape, most: float) -> Shape:
     """The shapes, shrunk until the variances along x and y are at most `most` px²; one that lies askew may still be longer along its axis."""
     xx, xy, yy, det = shape
     factor = most / torch.maximum(xx, yy).clamp_min(most)

@@ -55,9 +55,11 @@ class PixelIntegral:
     def visible(self, min_alpha: Tensor) -> Tensor:
         """Which splats are finite and reach `min_alpha` [N] somewhere, [N] bool. A splat of zero width has zero alpha."""
         zero = torch.zeros_like(self.long)
-        return torch.isfinite(torch.cat([self.packed(), self.xx[:, None], self.yy[:, None]], 1)).all(1) & (
-            self.alpha(self.packed(), zero, zero) >= min_alpha
-        )
+        return self.is_finite() & (self.alpha(self.packed(), zero, zero) >= min_alpha)
+
+    def is_finite(self) -> Tensor:
+        """Which splats are finite, [N] bool."""
+        return torch.isfinite(torch.cat([self.packed(), self.xx[:, None], self.yy[:, None]], 1)).all(1)
 
     def extents(self, min_alpha: Tensor) -> Tensor:
         """Half-sizes of a box around all pixels with alpha >= `min_alpha` [N], half a rotated pixel included; [N, 2] px, without gradient."""

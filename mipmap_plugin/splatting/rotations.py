@@ -12,7 +12,12 @@ LEAST_QUATERNION = 1e-15
 
 def rotations(quats: Tensor) -> Tensor:
     """Rotation matrices [N, 3, 3] of quaternions wxyz [N, 4] of any norm; a zero quaternion is the identity."""
-    w, x, y, z = unit(quats).unbind(-1)
+    return as_if_unit(unit(quats))
+
+
+def as_if_unit(quats: Tensor) -> Tensor:
+    """The matrices [N, 3, 3] of quaternions wxyz [N, 4] by the formula for a norm of 1. They are rotations only for that norm, and for 0."""
+    w, x, y, z = quats.unbind(-1)
     entries = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
                2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
                2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
@@ -20,29 +25,28 @@ def rotations(quats: Tensor) -> Tensor:
 
 
 def unit(quats: Tensor) -> Tensor:
-    """Normalize quaternions [N, 4]; a zero quaternion stays zero.
-
-    Each is divided by its largest component first, so that squares do not overflow. No gradient flows through that component,
-    which is exact: the result does not depend on it.
-    """
-    largest = quats.detach().abs().amax(-1, keepdim=True)
-    zero = largest < LEAST_QUATERNION
-    # `where` before the division and the root as well as after: their gradients at 0 are infinite, and infinity times zero is NaN.
-    scaled = torch.where(zero, 0.0, quats / torch.where(zero, 1.0, largest))
+    """Normalize quaternions [N, 4]; a zero quaternion stays zero."""
+    scaled, zero = _scaled(quats, quats.new_zeros(()))
+    # `where` before the root: its gradient at 0 is infinite, and infinity times zero is NaN.
     return scaled * torch.where(zero, 1.0, scaled.square().sum(-1, keepdim=True)).rsqrt()
 
 
 def unit_quaternions(quats: Tensor) -> Tensor:
-    """Normalize quaternions [N, 4], with a finite gradient everywhere; a zero quaternion becomes the identity.
-
-    Each is divided by its largest component first, so that squares do not overflow (as in `unit`).
-    """
-    largest = quats.detach().abs().amax(dim=1, keepdim=True)
-    is_zero = largest < LEAST_QUATERNION
-    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
-    scaled = torch.where(is_zero, identity, quats / torch.where(is_zero, 1.0, largest))
+    """Normalize quaternions [N, 4], with a finite gradient everywhere; a zero quaternion becomes the identity."""
+    scaled, _ = _scaled(quats, quats.new_tensor([1.0, 0.0, 0.0, 0.0]))
     unit: Tensor = scaled / scaled.norm(dim=1, keepdim=True)
     return unit
+
+
+def _scaled(quats: Tensor, of_zero: Tensor) -> tuple[Tensor, Tensor]:
+    """Quaternions [N, 4] divided by their largest component, so that squares do not overflow; and which of them are zero, [N, 1].
+
+    Zero ones become `of_zero`. No gradient flows through the component, which is exact: what is normalized next does not depend on it.
+    """
+    largest = quats.detach().abs().amax(-1, keepdim=True)
+    zero = largest < LEAST_QUATERNION
+    # `where` before the division as well as after: its gradient at 0 is infinite, and infinity times zero is NaN.
+    return torch.where(zero, of_zero, quats / torch.where(zero, 1.0, largest)), zero
 
 
 def quaternions(rotation: Tensor) -> Tensor:

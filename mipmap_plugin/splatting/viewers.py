@@ -19,7 +19,6 @@ from mipmap_plugin.registry import Registry
 from mipmap_plugin.render_settings import EvenBuckets, Packing
 from mipmap_plugin.screen_filters import DILATION
 from mipmap_plugin.splatting.native_viewers import BRUSH, FURTHER, UNITY
-from mipmap_plugin.splatting.viewer import EDGE as EDGE
 from mipmap_plugin.splatting.viewer import UP_TO_3, WEBGL
 from mipmap_plugin.splatting.viewer import Viewer as Viewer
 

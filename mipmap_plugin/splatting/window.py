@@ -80,9 +80,8 @@ class WindowIntegral(PixelIntegral):
 
         The bound is the integral over the whole splat, which excludes splats too thin to have a gradient in float32.
         """
-        finite = torch.isfinite(torch.cat([self.packed(), self.xx[:, None], self.yy[:, None]], 1)).all(1)
         shares = [(math.sqrt(2 * math.pi) * width / NARROWEST).clamp_max(1) for width in (self.long, self.short)]
-        return finite & (self.opacities * shares[0] * shares[1] >= min_alpha) & (self.short > 0)
+        return self.is_finite() & (self.opacities * shares[0] * shares[1] >= min_alpha) & (self.short > 0)
 
     def extents(self, min_alpha: Tensor) -> Tensor:
         """Half-sizes of a box around all pixels with alpha >= `min_alpha` [N] in any window, [N, 2] px, without gradient."""

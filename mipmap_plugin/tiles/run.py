@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report
-from mipmap_plugin.adaptation.views import refuse_blind, remarks, too_unlike
+from mipmap_plugin.adaptation.shown import refuse_blind, remarks, too_unlike
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.errors import JobsFailed, SettingsError
 from mipmap_plugin.formats.atomic import new_file, together, write_json

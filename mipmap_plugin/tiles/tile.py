@@ -91,7 +91,7 @@ class Tile:
         start, growth = start_file(self.scene.folder, self.number), self.config.most_growth
         most = sys.maxsize if growth is None else int(growth * len(Store(start)))
         return Task(
-            views, 1.0, around.wanted, around.render, white, validation, max_splats=most, render_views=around.render_views,
+            views, 1.0, around.wanted, [around.render], white, validation, max_splats=most, render_views=around.render_views,
             render_to_step=around.to_step, part=f"tile {self.number + 1} x{self.scene.scale:g}",
         )  # fmt: skip
 

@@ -8,7 +8,7 @@ import tiny
 import torch
 from brief_runs import is_finite, shrunk
 
-from mipmap_plugin.adaptation.views import remarks
+from mipmap_plugin.adaptation.shown import remarks
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model

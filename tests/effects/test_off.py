@@ -20,7 +20,6 @@ from mipmap_plugin.errors import PluginError
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.moving.deformable import DeformNetwork
 from mipmap_plugin.models.moving.hexplane import HexPlane
-from mipmap_plugin.models.moving.model import moved_to
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting import filters, harmonics
 from mipmap_plugin.wrap import wrap_model
@@ -136,7 +135,7 @@ def test_a_field_that_changes_nothing_is_not_evaluated(tmp_path, monkeypatch, fa
     adapted = model.adapt(1 / 4, **BRIEF)
     assert evaluated == [] and "time" not in adapted.report.views
     assert [effect.on for effect in adapted.report.effects if effect.name == "time"] == [False]
-    forced = ReferenceBackend().render(moved_to(model.model.field, model.model.canonical, 0.3), moving.at(0.3), model.effects()).image
+    forced = ReferenceBackend().render(moving.moved_to(model.model.field, model.model.canonical, 0.3), moving.at(0.3), model.effects()).image
     assert len(evaluated) == 1
     torch.testing.assert_close(image, forced, atol=1e-5, rtol=0)
 

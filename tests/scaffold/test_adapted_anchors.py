@@ -121,14 +121,6 @@ def test_the_paper_recipe_neither_clones_nor_splits_anchors(folder):
     assert len(adapted) == 40
 
 
-def test_a_baked_view_is_a_plain_file_that_shows_the_same(folder, tmp_path):
-    model = load_model(folder)
-    baked = load_model(model.bake(VIEWS[0]).save(tmp_path / "view.ply", provenance={}))
-    assert baked.family == "3dgs"
-    one, other = (wrap_model(shown, cameras=VIEWS).render(VIEWS[0]).image for shown in (model, baked))
-    torch.testing.assert_close(one, other, atol=1e-5, rtol=0)
-
-
 def test_without_cameras_an_orbit_goes_around_the_anchors(folder):
     adapted = wrap_model(load_model(folder)).adapt(1 / 16, steps=1, extra_views=2)
     assert adapted.report.views == "2 views of a generated orbit at 800 px (the checkpoint came without cameras)"

@@ -113,7 +113,7 @@ def judge(truth, views=2):
     """A validation for which a "model" is the brightness of each view."""
     cameras = tiny.cameras(views)
     shown = lambda brightness, camera: torch.full((*camera.size, 3), brightness[[view.name for view in cameras].index(camera.name)])  # noqa: E731
-    return Validation(cameras, cameras, 1.0, lambda view: torch.full((*view.size, 3), truth), shown, "area")
+    return Validation(cameras, cameras, 1.0, lambda view: torch.full((*view.size, 3), truth), [shown], "area")
 
 
 def shows(*brightness):

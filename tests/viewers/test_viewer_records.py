@@ -17,7 +17,8 @@ from mipmap_plugin.effects import Effects, explain
 from mipmap_plugin.errors import PluginError, SettingsError
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.render_settings import USUAL, RenderSettings
-from mipmap_plugin.splatting.viewers import BUILT_IN, EDGE, Viewer, find_viewer, viewers_for
+from mipmap_plugin.splatting.viewer import EDGE
+from mipmap_plugin.splatting.viewers import BUILT_IN, Viewer, find_viewer, viewers_for
 from mipmap_plugin.wrap import Wrapped
 
 # Records

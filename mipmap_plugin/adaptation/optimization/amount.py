@@ -13,7 +13,7 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.models.base import SplatModel
 
-# Views and splats that are counted; more change the result by a few percent.
+# Views and splats that are counted, to estimate how many splats a view shows; with more, the result changes by a few percent.
 VIEWS, SPLATS = 12, 1 << 16
 
 # At least this fraction of the steps is taken: it costs 1 to 3 dB of what all of them reach (docs/recipes_found.md), and fewer were not tried.
@@ -23,19 +23,20 @@ LEAST_FRACTION = 1 / 4
 # from the clock, so that a run can be resumed.
 DRAWS_A_SECOND = 3e6
 
-# The part of a run's draws that moments may take, each of which is evaluated so often, and the least number of moments: steps are worth more than
-# further moments, most of all in a time budget (docs/recipes_found.md).
+# The fraction of a run's draws that may be spent on moments, the number of times that each moment is evaluated, and the least number of moments.
 FOR_MOMENTS, ROUNDS, LEAST_MOMENTS = 1 / 2, 5, 6
+
+# The same in a time budget, where steps are worth even more than further moments (docs/recipes_found.md).
 FOR_MOMENTS_IN_BUDGET, LEAST_IN_BUDGET = 1 / 6, 2
 
-# Splats in all views for validation, for each second of a time budget: a view is drawn by many checks, or in every state that is chosen from, and
+# Splats in all validation views together, for each second of a time budget. Each view is drawn in many checks, or in every state that is chosen from:
 # as many views as without a budget would take a quarter of a run of two seconds.
 VALIDATED_A_SECOND = 1e5
 
 # The part of a time budget that looking at views may take, to find those that see a capture clearly.
 FOR_LOOKS = 1 / 4
 
-# The base is drawn so many times finer than the target at most.
+# Of a large scene, the base is drawn at most so many times finer than the target.
 OVERSAMPLING = 3
 
 
@@ -67,7 +68,7 @@ def affordable_moments(config: AdaptConfig, base: SplatModel) -> int | None:
 
 
 def _evaluation(base: SplatModel) -> float:
-    """As many splats are drawn in the time that one moment of a moving scene takes."""
+    """The cost of evaluating one moment of a moving scene: the number of splats that are drawn in the same time."""
     return len(base.parameters()["means"]) * float(getattr(base, "work", 0.0))
 
 
@@ -78,7 +79,7 @@ def takes_steps(config: AdaptConfig, scale: float, base: Effects, targets: Itera
 
 
 def affordable_for_model(config: AdaptConfig, base: SplatModel, views: Sequence[Camera], near: float) -> AdaptConfig:
-    """`affordable_for` a model's splats, and `validated_in_budget`; of one that moves, what its moments take is no longer there for steps."""
+    """`affordable_for` a model's splats, and `validated_in_budget`. Draws that the moments of a moving scene take are not available for steps."""
     config = validated_in_budget(config, base.parameters()["means"], views, near)
     if config.most_draws is None or not (base.traits.moves or base.traits.same_for_all_views):
         return config

@@ -65,7 +65,7 @@ class Pace:
         device = student.parameters()["means"].device
 
         def shortest(cameras: Sequence[Camera]) -> float:
-            return _shortest(lambda camera: task.render(student.gaussians(camera), camera), cameras, device)
+            return _shortest(lambda camera: task.renders[0](student.gaussians(camera), camera), cameras, device)
 
         def validates(view: Camera) -> None:
             validation.viewer_psnrs(student, [view])
@@ -77,7 +77,7 @@ class Pace:
         truth = TRUTH_OVER_IMAGE * image * (size / task.scale) ** 2
         truth = truth if truth > left else _shortest(task.truth, views, device)
         moments = {view.time for view in validation.choosing} if task.follow.moments else ()
-        look = first = image * (1 + len(validation.further_renders))
+        look = first = image * len(validation.renders)
         if any(view.zoomed(task.scale).size != cameras[0].size for view in validation.choosing[:1]):
             look = _shortest(validates, validation.steering[:REPEATS], device)
             first = _seconds(validates, validation.choosing[0], device)  # with its truth
@@ -134,7 +134,7 @@ def plan_note(run: Run, config: AdaptConfig) -> str:
     return f" ({taken}planned for the time budget in place of {config.steps})"
 
 
-def no_steps_notes(run: Run, config: AdaptConfig, share: float = 1.0) -> list[str]:
+def no_steps_notes(run: Run, config: AdaptConfig, share: float) -> list[str]:
     """That a time budget, of which the run has a share, left no time for steps, and which one would; empty if it did."""
     if config.time_budget_s is None or run.step or run.seconds < config.time_budget_s:
         return []

@@ -93,7 +93,7 @@ class Forecast:
         # Since half of the steps: the first ones take longer than all others.
         draws, spent = self.history[len(self.history) // 2 - 1] if len(self.history) > 1 else (first, 0.0)
         a_view = (self.history[-1][1] - spent) / (done - draws)
-        new_views = max(0, min(self.schedule.views, last) - len(costs.truths))
+        new_views = max(0, min(self.schedule.view_count, last) - len(costs.truths))
         checks = self.checks_until(self.config.steps) - self.checks_until(step)
         motion = self.evaluations.seconds(step, ceiling, last - done, checks)
         return (last - done) * a_view + new_views * _mean(costs.truths.values()) + checks * _mean(costs.checks) + motion

@@ -1,4 +1,4 @@
-"""How often a run evaluates the field of a moving scene: less and less often, as rates fall, so that the time so far does not tell it."""
+"""The time that a run will spend on the field of a moving scene: evaluations become rarer as rates fall, so that the time so far does not tell it."""
 
 from __future__ import annotations
 
@@ -15,27 +15,28 @@ SPEED = 2.5
 
 
 class Evaluations:
-    """Foretells them from how far splats have moved so far by the rates that they had, and at first from what is usual.
+    """Foretells the evaluations from how far splats have moved so far under the learning rates of the steps; at first from what is usual.
 
-    A round lasts until splats have moved so far that every moment has to be evaluated anew, which is done when a view shows it.
+    A round lasts until splats have moved so far that the field has to be evaluated anew. A moment is evaluated when a view shows it for the first
+    time in a round.
     """
 
     def __init__(self, follow: Following, config: AdaptConfig, checked: int = 0) -> None:
-        """`checked`: the number of views that a check draws."""
+        """`checked`: the number of views that each check draws."""
         self._follow, self._config, self._checked, self._before = follow, config, checked, follow.seconds
-        steps = range(config.steps if follow.moments else 0)  # of other scenes there is nothing to foretell, and steps may be millions
+        steps = range(config.steps if follow.moments else 0)  # other scenes have no evaluations, and steps may be millions
         factors = [warmed_up(step, config) * decayed(config, step / config.steps) for step in steps]
         self._factors = torch.tensor(factors, dtype=torch.float64)
         self._squares = 0.0  # px², the sum over all steps so far of their squared rates
 
     def spent(self) -> float:
-        """Seconds of those since the run began."""
+        """Seconds of the evaluations since the run began."""
         return self._follow.seconds - self._before
 
     def seconds(self, step: int, ceiling: float, draws: int, checks: int) -> float:
-        """Seconds of those after `step`, called after each step: of steps that draw `draws` views in all, and of so many checks.
+        """Seconds that evaluations after `step` will take; called after each step.
 
-        `ceiling`: of the rates' factor (`Steering`).
+        `draws`: the number of views that the steps left draw; `checks`: the number of checks left; `ceiling`: of the rates' factor (`Steering`).
         """
         if not self._follow.moments:
             return 0.0
@@ -51,7 +52,7 @@ class Evaluations:
         return self._follow.evaluation * self._count(0, 1.0, self._config.steps * self._config.views_per_step)
 
     def _count(self, step: int, ceiling: float, draws: float) -> float:
-        """How many moments are evaluated by so many draws after `step`."""
+        """How many evaluations so many draws after `step` need."""
         wandered = (self._squares + self._rates(step, ceiling).square().cumsum(0)).sqrt()  # px after each step
         before, most = self._squares**0.5, self._follow.moments
         a_round = (before + self._follow.reach / SPEED) / (self._follow.rounds + 1)  # as if one had taken what is usual
@@ -62,5 +63,5 @@ class Evaluations:
         return float((new * -torch.expm1(-views / most)).sum())
 
     def _rates(self, step: int, ceiling: float) -> Tensor:
-        """Those of the means from `step` on, px."""
+        """The learning rates of the means from `step` on, px."""
         return self._config.rates.means * self._factors[step:].clamp(max=ceiling)

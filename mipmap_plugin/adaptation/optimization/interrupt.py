@@ -14,8 +14,9 @@ from mipmap_plugin.process.signals import presses
 def interruptible() -> Iterator[Callable[[], bool]]:
     """Inside, Ctrl-C is only recorded, and the yielded function returns whether it was pressed since it was last called.
 
-    A second one that is not the same (`presses`) raises KeyboardInterrupt as soon as Python runs, after a call of a kernel, in the middle of a step:
-    of the run is left what was saved before. One while what the first one asked for is done, such as saving, is only recorded again.
+    A second press (`presses` tells it from the first) raises KeyboardInterrupt as soon as Python runs, which is after a call of a kernel, in the
+    middle of a step: the run keeps only what it has saved. A press while the caller does what the first one asked for, such as saving, is only
+    recorded again.
     """
     known, pressed = presses(), False
 

@@ -30,12 +30,17 @@ from mipmap_plugin.models.base import count_of
 from mipmap_plugin.process.threads import side_by_side
 from mipmap_plugin.progress import ticking
 
-# Number of checks during the warm-up, while the rates rise, and of a short run, with so many steps between two: each takes as long as a step.
-CHECKS_IN_WARM_UP, CHECKS, STEPS_BETWEEN = 10, 6, 5
+# Number of checks during the warm-up, while the rates rise.
+CHECKS_IN_WARM_UP = 10
 
-# Truths that each of several threads makes at a time, since all wait for the last one; and steps that are searched for each: as long as views
-# are new, most steps have one.
-TRUTHS_AT_ONCE, STEPS_AHEAD = 4, 2
+# Number of checks of a short run, at least STEPS_BETWEEN steps apart, because a check takes as long as a step.
+CHECKS, STEPS_BETWEEN = 6, 5
+
+# Truths that each of several threads makes at a time: the more, the less the threads wait for one another.
+TRUTHS_AT_ONCE = 4
+
+# Steps that are searched for each truth that is made ahead: as long as views are new, most steps have one.
+STEPS_AHEAD = 2
 
 
 def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run], None], observe: Callable[[Run], object] = lambda run: None) -> End:
@@ -196,7 +201,7 @@ def _compare(task: Task, config: AdaptConfig, view: Camera, image: Tensor, targe
 
 
 def _make_truths(run: Run, task: Task, config: AdaptConfig, order: ViewSchedule, views: Sequence[Camera]) -> None:
-    """Make the truths of the views of a step that none used yet, and of some that are used next: in one call, or some in every thread."""
+    """Make the truths of a step's views that have none yet, and of some views that are used next: in one call, or several in each thread."""
     known, new = run.costs.truths, [view for view in views if view not in run.costs.truths]
     if not new:
         return

@@ -39,12 +39,11 @@ class Task:
     views: Sequence[Camera]  # at the base scale
     scale: float
     truth: Callable[[Camera], Tensor]  # a view of the base scale -> [h, w, 3] at the new scale
-    render: Callable[[Gaussians, Camera], Tensor]  # splats and a camera of the new scale -> [h, w, 3]
+    renders: Sequence[Callable[[Gaussians, Camera], Tensor]]  # splats and a camera of the new scale -> [h, w, 3]; of each viewer they are adapted for
     white_background: bool
     validation: Validation
     detail: Callable[[Camera, Tensor], Tensor] | None = None  # a view and its image -> a further part of the loss
     max_splats: int = sys.maxsize  # growing stops at this number
-    further_renders: Sequence[Callable[[Gaussians, Camera], Tensor]] = ()  # `render` of further viewers that the same splats are adapted for
     render_views: ViewsRenderer | None = None  # the same in one call, if the backend can
     render_to_step: SteppingRenderer | None = None  # the same if the backend can move the splats itself
     follow: Following = field(default_factory=Following)  # called before each step
@@ -57,7 +56,7 @@ class Task:
 
     def renderer(self, draw: int) -> Callable[[Gaussians, Camera], Tensor]:
         """The function that renders the `draw`-th view since the beginning: the viewers take turns."""
-        return (self.render, *self.further_renders)[draw % (1 + len(self.further_renders))]
+        return self.renders[draw % len(self.renders)]
 
     def images(self, gaussians: Gaussians, cameras: Sequence[Camera], draw: int) -> list[Tensor]:
         """The images [h, w, 3] of the `draw`-th view since the beginning and of those after it."""
@@ -75,7 +74,7 @@ class Task:
         errors = []
         for view in evenly(self.views, AGREEMENT_VIEWS):
             camera = view.zoomed(self.scale)
-            image = self.render(student.gaussians(camera), camera)
+            image = self.renders[0](student.gaussians(camera), camera)
             errors.append(difference_from(self.truth(view), image, config.resize).square().mean())
         return decibel(float(torch.stack(errors).mean()))
 

@@ -44,16 +44,14 @@ class Snapshot:
         is the same.
         """
         model = initial.copy()
-        if self.rows_changed:
-            model.replace_parameters({name: tensor.clone().requires_grad_() for name, tensor in self.rows.items()})
-        self.put_into(model)
+        self.put_into(model, anew=self.rows_changed)
         return model
 
     @torch.no_grad()
-    def put_into(self, model: SplatModel) -> None:
-        """Set `model`, a copy of the snapshot's model, to the snapshot: in its own leaves where there are as many rows."""
+    def put_into(self, model: SplatModel, *, anew: bool = False) -> None:
+        """Set `model`, a copy of the snapshot's model, to the snapshot: in its own leaves, unless the number of rows is another, or `anew`."""
         parameters = model.parameters()
-        if len(parameters["means"]) != len(self.rows["means"]):
+        if anew or len(parameters["means"]) != len(self.rows["means"]):
             model.replace_parameters({name: tensor.clone().requires_grad_() for name, tensor in self.rows.items()})
         else:
             for name, tensor in parameters.items():

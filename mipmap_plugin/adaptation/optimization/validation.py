@@ -85,9 +85,8 @@ class Validation:
     choosing: Sequence[Camera]
     scale: float
     truth: Callable[[Camera], Tensor]  # a view of the base scale -> the image to compare with
-    render: Callable[[Gaussians, Camera], Tensor]  # splats and a camera of the new scale -> image
+    renders: Sequence[Callable[[Gaussians, Camera], Tensor]]  # splats and a camera of the new scale -> image; of each viewer they are adapted for
     resize: str  # the filter that brings an image to the truth's size
-    further_renders: Sequence[Callable[[Gaussians, Camera], Tensor]] = ()  # `render` of further viewers that the same splats are adapted for
 
     def viewer_psnrs(self, model: SplatModel, views: Sequence[Camera]) -> list[float]:
         """The mean PSNR (dB) over views, per viewer, of images clamped as a display does, each at most 54 (INVISIBLE_ERROR); 0 without views."""
@@ -96,9 +95,8 @@ class Validation:
     @torch.no_grad()
     def _errors(self, model: SplatModel, views: Sequence[Camera]) -> list[list[float]]:
         """The mean square error of each view, per viewer."""
-        renders = (self.render, *self.further_renders)
         if not views:
-            return [[] for _ in renders]
+            return [[] for _ in self.renders]
         shared = model.gaussians(views[0]) if model.traits.same_for_all_views else None
         cameras = [view.zoomed(self.scale) for view in views]
         threads = max_threads(model.parameters()["means"], cameras[0])
@@ -107,12 +105,12 @@ class Validation:
             image = draw(cameras[number]).clamp(0, 1)
             return difference_from(self.truth(views[number]), image, self.resize).square().mean()
 
-        draws = [_drawing(render, model, shared, cameras) for render in renders]
+        draws = [_drawing(render, model, shared, cameras) for render in self.renders]
         errors = [list(side_by_side(partial(error, draw), range(len(views)), threads)) for draw in draws]
         return [torch.stack(each).tolist() for each in errors]  # a GPU is waited for once, and not for each view
 
     def kept(self) -> Validation | None:
-        """The views that choose with their truth alone, to judge by when the run and what it holds are gone; None if there are none."""
+        """This validation with the choosing views alone and their truths in memory, to judge files after the run; None if there are no such views."""
         if not self.choosing:
             return None
         truths = {view: self.truth(view) for view in self.choosing}
@@ -146,7 +144,7 @@ class Validation:
 def _drawing(
     render: Callable[[Gaussians, Camera], Tensor], model: SplatModel, shared: Gaussians | None, cameras: Sequence[Camera]
 ) -> Callable[[Camera], Tensor]:
-    """What draws a model for each of `cameras`; its splats are `shared` by all of them, if they are."""
+    """A function that draws a model for any of `cameras`. `shared`: the splats, if they are the same for all cameras."""
     if shared is None:
         return lambda camera: render(model.gaussians(camera), camera)
     if not isinstance(render, Renderer):
@@ -164,13 +162,13 @@ def mean_db(errors: Sequence[float]) -> float:
 
 
 def _visible_db(errors: Sequence[float]) -> float:
-    """The mean PSNR (dB) over views as far as differences are visible: of good views it hardly changes."""
+    """The mean PSNR (dB) over views as far as differences are visible; for good views it hardly changes."""
     return fmean(decibel(error + VISIBLE_ERROR) for error in errors) if errors else 0.0
 
 
 def no_validation(truth: Callable[[Camera], Tensor], render: Callable[[Gaussians, Camera], Tensor]) -> Validation:
     """Validation without views, for a training, in which no step is undone."""
-    return Validation([], [], 1.0, truth, render, "area")
+    return Validation([], [], 1.0, truth, [render], "area")
 
 
 def split_validation(
@@ -266,15 +264,15 @@ class Steering:
         self.ceiling = self.best_factor if lower else RATE_REDUCTION * rate_factor
 
     def dare(self, progress: float, config: AdaptConfig) -> None:
-        """Limit no rates and take nothing back any more if limited ones hardly gained while new views came: there is little to lose.
+        """Stop limiting rates and undoing steps if limited rates hardly gained anything while new views came: there is little to lose.
 
-        Where few views show a splat, any rate does harm at first, and high ones gain in the end, as they fall.
+        Where few views show each splat, any rate does harm at first, but high ones gain in the end, as they fall.
         """
         if config.warm_up and config.gathering and self.ceiling < 1 and progress >= config.gathering and self._gained_db() <= LOST_DB:
             self.ceiling, self.bold = 1.0, True
 
     def _gained_db(self) -> float:
-        """What was gained, of the whole error: of a start that is good in itself the visible one hardly changes, and there is more to lose."""
+        """The gain of the best state over the start, dB, by the whole error: the visible error of a good start hardly changes."""
         start, best = (max(10 ** (-db / 10) - VISIBLE_ERROR, INVISIBLE_ERROR) for db in (self.start_db, self.best_db))
         return decibel(best) - decibel(start)
 

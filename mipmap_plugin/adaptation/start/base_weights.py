@@ -1,4 +1,4 @@
-"""What its views show of the base: the sizes of their pixels, and how much each splat contributes to their images."""
+"""What the views of a base show: the sizes of their pixels, and how much each splat contributes to their images."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.render_settings import MIN_ALPHA
 
-# The user is told where no view shows more than this fraction of the splats, for dB say nothing of them. Captures have up to a quarter.
+# The user is told if a larger fraction of the splats is shown by no view, since dB say nothing of these. In captures it is up to a quarter.
 HIDDEN = 1 / 3
 
 
 class BaseWeights:
-    """The blend weights of the base's splats, and by which views they are known. Before `measured` only pixel sizes are."""
+    """The blend weights of the base's splats, and the views that they were measured in; pixel sizes, also before `measured` is called."""
 
     def __init__(self, problem: StartProblem, clock: Clock) -> None:
         self._problem, self._clock = problem, clock

@@ -49,7 +49,7 @@ def weighed(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, eff
 
 
 def _of_views(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects) -> Iterator[Tensor]:
-    """The sum of each splat's blend weights over each view, [V, N], of some views after the others.
+    """The sum of each splat's blend weights over each view, [V, N] for each batch of views.
 
     An image is linear in the splats' colors, so that the weights are the gradient of the image's sum with respect to the colors. Works
     with any backend that has gradients, and faster with one that computes them itself, for a view (`Backend.blend_weights`) or for several
@@ -81,7 +81,7 @@ def whole_weights(gaussians: Gaussians, pixel: Tensor, views: Sequence[Camera], 
 
 
 def may_show(weights: Tensor, whole: Tensor, means: Tensor, views: Sequence[Camera], looked_at: Sequence[Camera]) -> Tensor:
-    """[N] bool: which splats views show, by their `weights` in those that were looked at, or may show: where only others have them in the picture.
+    """[N] bool: which splats the views show, by their `weights` in the views `looked_at`, or may show: those only in pictures of other views.
 
     `whole` [N]: `whole_weights`; `means` [N, 3].
     """

@@ -30,26 +30,26 @@ from mipmap_plugin.screen_filters import INTEGRATED
 # The powers of `merge_to` that are tried: the last, the mildest, and then the others, until merging loses little enough.
 POWERS = (1, 1 / 2, 1 / 4)
 
-# dB that the mildest may cost before steps for a renderer that draws otherwise than the training did, also where other merging may cost less: fewer
-# splats learn that sooner, and better, but what stronger merging costs does not come back (docs/recipes_found.md).
+# dB that the mildest merging may cost before steps for a renderer that draws otherwise than the training did, even if the settings allow less: fewer
+# splats learn that sooner, and better. What stronger merging costs does not come back (docs/recipes_found.md).
 MILD_COSTS = 0.6
 
-# Before them, what starts from a finer level is merged even where too few of its splats share a pixel: else chair would keep half of them at x0.57.
-# What is left has to show at least so many dB: from 29 dB steps regained all that merging cost, from 20 dB a third.
+# The powers that are tried before those for a start from a finer level, whose splats are merged even where too few share a pixel: otherwise chair
+# would keep half of them at x0.57. The result has to have LEAST_DB: from 29 dB steps regained all that merging had cost, from 20 dB a third.
 COARSE_POWERS, LEAST_DB = (1, 7 / 8, 3 / 4, 5 / 8, 1 / 2), 25.0
 
-# dB by which what is left may be worse than the base itself: steps regain 3 to 8 dB. What fails is merged less.
+# dB by which such a result may be worse than the base itself: steps regain 3 to 8 dB.
 COARSE_COSTS = 3.0
 
-# The fraction of a time budget that the start may take: what it would not finish in it is left out, from the strongest merging on.
+# The fraction of a time budget that the start may take. Candidates that would not be finished in it are left out.
 START_SHARE = 0.5
 
-# Merging that leaves this fraction of the splats at most makes steps so much faster that in a time budget too short for a search it is begun with, if
-# no more than so many times the fraction are left. Lego and chair keep up to 1.3 times the fraction, and gain 0.6 to 5 dB by it; two captures and
-# three other scenes keep 2.1 times and more, and the captures' starts would lose 0.7 to 2 dB.
+# In a time budget that is too short for a search, a run begins with the strongest merging if that is to leave at most FAR_FEWER of the splats, which
+# makes steps much faster, and really leaves at most REACHED times as many as it is to. Lego and chair keep up to 1.3 times as many, and gain 0.6 to
+# 5 dB by it; two captures and three other scenes keep 2.1 times as many and more, and the captures' starts would lose 0.7 to 2 dB.
 FAR_FEWER, REACHED = 1 / 4, 1.5
 
-# The part of a start's time in which a search has to end that begins all the same: whole runs spend less of theirs.
+# The budget is long enough for a search if that is expected to end within this part of the start's time; whole runs need less of it.
 SEARCH_PART = 1 / 4
 
 
@@ -132,7 +132,7 @@ class StartSearch:
         return (formed, start_name(True)) if self._forms and after.visible >= before.visible else (base, problem.name)
 
     def _merged_at_once(self, weights: Tensor | None) -> SplatModel | None:
-        """What is merged furthest, where a time budget is too short for a search and that betters the base; else None."""
+        """The strongest merging, where a time budget is too short for a search and this is no worse than the base; else None."""
         problem, student, fraction = self._problem, self._problem.base(), self._fraction(1)
         if not self._clock.limited or weights is None or student.traits.thins or problem.coarse_base is not None:
             return None
@@ -158,10 +158,10 @@ class StartSearch:
         return max(least, (formed.psnr + problem.quality(problem.coarse_base()).psnr) / 2)
 
     def _merged(self, weights: Tensor | None, bounds: Bounds, coarse_bounds: Bounds | None) -> SplatModel | None:
-        """What is merged furthest within bounds; None if merging costs too much.
+        """The candidate of the strongest merging within the bounds; None if merging costs too much.
 
-        Splats that can hardly be merged lose too much by the mildest merging already, as those of captures do: then no other is tried. Where
-        that gains, and the base as it is looks better still, a stronger one may be better than both.
+        If the mildest merging already loses too much, as with captures, no stronger one is tried. If the mildest gains, a stronger one is tried
+        even where the base as it is looks better, since it may be better than both.
         """
         for power in COARSE_POWERS if coarse_bounds else ():
             if not self._clock.allows("candidate", self._fraction(power)):
@@ -189,7 +189,7 @@ class StartSearch:
             return candidate, self._problem.quality(candidate)
 
     def _fraction(self, power: float) -> float:
-        """Of the splats, that is left by a power of `merge_to`."""
+        """The fraction of the splats that a power of `merge_to` leaves."""
         return max(self._least, math.pow(self._problem.config.merge_to, power))
 
     def _coarse_bounds(self, bounds: Bounds, finer: Quality) -> Bounds | None:

@@ -1,4 +1,4 @@
-"""What the rest of a start's time allows."""
+"""The time that is left for a start, and what can be done in it."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ import torch
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.process.clock import now
 
-# px, the geometric mean of a view's sides: to weigh them views are made no smaller, for one of this size takes a twentieth of a second. And the
-# fraction of the time left that weighing the first views may take: the same is done again for the closed form.
-LEAST_SIDE, WEIGHING = 1000, 1 / 3
+# px, the geometric mean of a view's sides: views are not made smaller than this to weigh splats in them, which takes a twentieth of a second.
+LEAST_SIDE = 1000
+
+# The fraction of the time left that weighing splats in the first views may take, since they are weighed again for the closed form.
+WEIGHING = 1 / 3
 
 
 class Clock:
@@ -32,7 +34,7 @@ class Clock:
 
     @property
     def limited(self) -> bool:
-        """Whether the time ends at all."""
+        """Whether the time is limited at all."""
         return not math.isinf(self._seconds)
 
     def allows(self, work: str, amount: float = 1.0, part: float = 1.0) -> bool:

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from mipmap_plugin.adaptation.parallel import views_at_once
+from mipmap_plugin.adaptation.renderers import unrounded
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.closed_form import closed_form
 from mipmap_plugin.adaptation.start.merging import merge
@@ -16,6 +17,7 @@ from mipmap_plugin.backends.base import AdamStep, Calls
 from mipmap_plugin.camera import ONE_PIXEL, Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.base import OF_3DGS
 from mipmap_plugin.render_settings import USUAL
 
 
@@ -51,8 +53,7 @@ def _step(backend: Any, splats: Gaussians, effects: Effects) -> None:
     """A step that moves nothing."""
     raw = {name: getattr(splats, name).clone() for name in ("means", "quats", "scales", "opacities", "sh")}
     stepper = backend.stepper(raw)
-    unpacked = replace(effects, settings=replace(effects.settings, packing=None))
-    stepper.differentiate(0, torch.zeros_like(stepper.render(0, ONE_PIXEL, unpacked).image))
+    stepper.differentiate(0, torch.zeros_like(stepper.render(0, ONE_PIXEL, unrounded(effects)).image))
     moments = {name: torch.zeros_like(tensor) for name, tensor in raw.items()}
-    rates = dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 0.0)
+    rates = dict.fromkeys(OF_3DGS, 0.0)
     stepper.step(AdamStep(raw, moments, moments, rates, betas=(0.9, 0.999), correction=1.0, eps=1.0))

@@ -1,4 +1,4 @@
-"""What a start is looked for by: the base, the target, and what measures the candidates."""
+"""The request for a start: the base, the target, and what measures the candidates."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class FinerLevel:
 
 @dataclass(frozen=True, eq=False)
 class StartProblem:
-    """The request for a start: the base, the target, and what measures the candidates."""
+    """What a start is searched for and with."""
 
     base: Callable[[], SplatModel]  # makes a copy of the base that is rendered with the target's screen filter; it may share the base's tensors
     views: Sequence[Camera]  # at the base scale

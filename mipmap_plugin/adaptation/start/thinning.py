@@ -15,8 +15,8 @@ from mipmap_plugin.adaptation.start.merging import along_curve
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.models.base import SplatModel
 
-# At least so many splats a target pixel stay. Of the anchors of an object that have 5 to 15 after thinning none are missed at x1/2 to x1/8; small
-# scenes that have 1.3 before it lose 4 to 9 dB by it.
+# At least so many splats per target pixel stay. An object that has 5 to 15 of them after thinning loses nothing by it at x1/2 to x1/8; small scenes
+# that have 1.3 before it lose 4 to 9 dB.
 PER_PIXEL = 3.0
 
 # Views in which splats are counted.
@@ -31,7 +31,7 @@ def least_fraction(model: SplatModel, views: Sequence[Camera], scale: float) -> 
 
 
 def evenly_in_space(means: Tensor, pixel: Tensor, fraction: float) -> Tensor:
-    """Which of the `means` [N, 3] are a `fraction` (0..1) of them that lies where they all lie, [N] bool: every so many along a curve through them.
+    """[N] bool: a `fraction` (0..1) of the `means` [N, 3], spread as all of them are: those at equal intervals along a curve through them.
 
     `pixel` [N]: the size of a target pixel at each, in world units.
     """

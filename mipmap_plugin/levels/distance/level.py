@@ -94,7 +94,7 @@ class LevelRun:
         self.unmerged = Mixture.of(scene.rule, scene.chunks, [*finest, finest[-1], *coming])
         self.shares = ImageStore(LIMIT, self.finest.means)
         self.truth = lambda view: truth(view) * self._share(view)
-        self.validation = Validation(steering, choosing, 1.0, self.truth, self._render, self.config.resize)
+        self.validation = Validation(steering, choosing, 1.0, self.truth, [self._render], self.config.resize)
         self.fixed, self.mixture = 0, self.unmerged
 
     def _render(self, splats: Gaussians, camera: Camera) -> Tensor:
@@ -125,7 +125,7 @@ class LevelRun:
         states = {f"the start, {name}": initial}
         self.seconds["start"] = self.seconds["total"] = now(self.finest.means.device) - began
         if self.config.steps:
-            task = WalkTask(self.views, 1.0, self.truth, self._render, False, self.validation, part=f"level {self.number}", size=self.size)
+            task = WalkTask(self.views, 1.0, self.truth, [self._render], False, self.validation, part=f"level {self.number}", size=self.size)
             keeper = StateKeeper(resume, self._fingerprint())
             run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
             ended_by = adapt(run, task, self.config, keeper.save_and_stop, keeper.save_if_due).told(self.config, run.step)

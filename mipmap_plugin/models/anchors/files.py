@@ -20,7 +20,7 @@ from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.models.anchors.networks import Weights, check_networks, read_networks
 from mipmap_plugin.models.base import CARRIED, TrainedScale
 from mipmap_plugin.models.columns import NORMAL, POSITION, QUATERNION, numbered, stacked
-from mipmap_plugin.models.detect import Checkpoint, detect_as
+from mipmap_plugin.models.detect import detect_as
 from mipmap_plugin.models.health import LARGEST, dropped
 from mipmap_plugin.models.inria_folder import read_options, trained_scale
 from mipmap_plugin.models.vanilla import Origin
@@ -61,7 +61,7 @@ def read_anchors(path: str | Path, family: str, iteration: int | None) -> Anchor
     parameters, dropped = _checked(parameters, carried, weights, checkpoint.path)
     first = {name: column[:2].copy() for name, column in ply.columns.items()}
     options, notes = read_options(checkpoint.folder)
-    origin = _origin(checkpoint, ply.comments)
+    origin = Origin(checkpoint.path, sha256(checkpoint.path), checkpoint.folder, checkpoint.iteration, ply.comments)
     every_note = (*checkpoint.notes, *ply.notes, *notes, *dropped, *_rounded(ply.columns, carried, checkpoint.path))
     return AnchorFile(parameters, carried, weights, companions, options, trained_scale(options), origin, first, every_note)
 
@@ -157,19 +157,13 @@ def needs_views(views: Any) -> None:
         raise SettingsError("the splats of anchors exist only for a camera; give at least one view")
 
 
-def _origin(checkpoint: Checkpoint, comments: tuple[str, ...]) -> Origin:
-    return Origin(checkpoint.path, sha256(checkpoint.path), checkpoint.folder, checkpoint.iteration, comments)
-
-
 def _checked(parameters: dict[str, Tensor], carried: tuple[str, ...], weights: Weights, where: Path | str) -> tuple[dict[str, Tensor], list[str]]:
-    """The finite anchors, after a check that the networks fit them, and a note if some were dropped."""
+    """The anchors that are finite and at most LARGEST once activated, and a note if some were dropped; columns that no family reads do not count.
+
+    Raises CheckpointError if the networks do not fit the anchors, or if no anchor is left.
+    """
     folder = where.parent if isinstance(where, Path) else where
     check_networks(weights, parameters["features"].shape[1], parameters["offsets"].shape[1], folder)
-    return _finite(parameters, carried, where)
-
-
-def _finite(parameters: dict[str, Tensor], carried: tuple[str, ...], where: Path | str) -> tuple[dict[str, Tensor], list[str]]:
-    """The anchors that are finite and at most LARGEST once activated, and a note if some were dropped; columns that no family reads do not count."""
     read = [number for number, name in enumerate(carried) if name in LEVELS]
     values = [*(parameters | {CARRIED: parameters[CARRIED][:, read]}).values(), parameters["scales"].exp()]
     valid = torch.stack([(value.flatten(1).abs() <= LARGEST).all(1) for value in values]).all(0)  # False for NaN

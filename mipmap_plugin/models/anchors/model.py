@@ -22,7 +22,7 @@ from mipmap_plugin.formats.tags import with_tags
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.anchors.decoding import Anchors, decode
 from mipmap_plugin.models.anchors.files import AnchorFile, cfg_text, needs_views, refuse_others, to_columns, write_beside
-from mipmap_plugin.models.anchors.networks import appearance_size, packed, refuse_infinite
+from mipmap_plugin.models.anchors.networks import EMBEDDING, appearance_size, packed, refuse_infinite
 from mipmap_plugin.models.anchors.prefilter import in_view
 from mipmap_plugin.models.base import CARRIED, Traits
 from mipmap_plugin.models.columns import QUATERNION
@@ -30,7 +30,6 @@ from mipmap_plugin.models.health import LARGEST
 from mipmap_plugin.models.inria_folder import write_folder
 from mipmap_plugin.models.outputs import finite, refuse_parts
 from mipmap_plugin.models.raw import MIN_SCALE
-from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting.rotations import unit_quaternions
 
 # Views sampled for the opacities of anchors, and for reshaping: the networks vary slowly with the direction.
@@ -78,10 +77,6 @@ class AnchorModel(ABC):
         """The splats of the anchors in view, activated: SH of degree 0, opacities above 0."""
         rows = (self._chosen(camera) & self._in_view(camera)).nonzero()[:, 0]
         return decode(self._anchors(rows, camera), self._weights, self._inputs, camera)[0]
-
-    def bake(self, camera: Camera) -> VanillaModel:
-        """A plain 3DGS model of what this camera sees, valid near this view only: colors, opacities and shapes depend on the direction."""
-        return VanillaModel.from_gaussians(self.gaussians(camera), self.trained)
 
     def parameters(self) -> dict[str, Tensor]:
         """The raw parameters by name, without copying them."""
@@ -213,7 +208,7 @@ class AnchorModel(ABC):
             if takers := [network for network, taken in self._inputs.items() if name in taken]:
                 notes.append(f"{extra} goes into {', '.join(takers)}")
         if "appearance" in self._weights:
-            count = len(self._weights["appearance"]["embedding.weight"])
+            count = len(self._weights["appearance"][EMBEDDING])
             upstream = "its project gives the n-th test view the appearance of the n-th training view (evaluate --appearance upstream)"
             notes.append(f"it has an appearance for each of {count} training views; any other camera gets their mean, where {upstream}")
         return notes

@@ -30,6 +30,8 @@ from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.models.tagged import as_tagged
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 
+PLACE, FILE = GSPLAT
+
 NAMES = ("means", "scales", "quats", "opacities", "sh0", "shN")
 
 # World units, the trainer's default.
@@ -63,14 +65,14 @@ class GsplatHost:
         content = {**self.siblings, "splats": splats, "comments": list(comments)}
         if path.suffix == ".pt":
             return save_torch(path, content, overwrite=overwrite)
-        within = Path("ckpts", f"ckpt_{self.siblings['step']}_rank0.pt")
+        within = Path(PLACE, f"ckpt_{self.siblings['step']}_rank0.pt")
         with new_folder(path, overwrite) as fresh:
             save_torch(fresh / within, content, overwrite=False)
             self._write_options(fresh, antialiased=render_mode(comments) == "antialiased")
         return path / within
 
     def holds(self, path: Path) -> str | None:
-        return None if path.suffix == ".pt" else "ckpts"
+        return None if path.suffix == ".pt" else PLACE
 
     def as_trained(self, cameras: Sequence[Camera], capture: Capture, means: Tensor) -> list[Camera]:
         """The cameras resized by `data_factor`, in the normalized frame, which is recomputed from the cameras and points.
@@ -133,10 +135,10 @@ def load_gsplat(path: str | Path, *, iteration: int | None = None) -> VanillaMod
 
 def rank_files(path: Path) -> list[Path]:
     """The files of the same step as `path`, in the order of their ranks. Raises CheckpointError if a rank in between is missing."""
-    name = re.fullmatch(GSPLAT[1], path.name)
+    name = re.fullmatch(FILE, path.name)
     if not name or name["rank"] is None:
         return [path]
-    siblings = (re.fullmatch(GSPLAT[1], file.name) for file in path.absolute().parent.iterdir())
+    siblings = (re.fullmatch(FILE, file.name) for file in path.absolute().parent.iterdir())
     ranks = {int(file["rank"]): path.with_name(file.string) for file in siblings if file and file["rank"] and file["step"] == name["step"]}
     if len(ranks) <= max(ranks):
         missing = next(rank for rank in count() if rank not in ranks)
@@ -200,10 +202,10 @@ def _options(folder: Path | None) -> tuple[dict[str, Any], list[str]]:
 
 
 def _trained(options: dict[str, Any]) -> TrainedScale:
-    antialiased = "antialiased" if options.get("antialiased") else "classic"
+    screen_filter = "antialiased" if options.get("antialiased") else "classic"
     resolution, near = _positive(options, "data_factor", TrainedScale.resolution), _positive(options, "near_plane", NEAR_PLANE)
     up = UP if options.get("normalize_world_space", True) else None
-    return TrainedScale(antialiased, resolution=resolution, near_plane=near, up=up)
+    return TrainedScale(screen_filter, resolution=resolution, near_plane=near, up=up)
 
 
 def _positive(options: dict[str, Any], key: str, default: float) -> float:

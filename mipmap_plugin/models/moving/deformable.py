@@ -16,6 +16,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.moving.memory import Changes
 from mipmap_plugin.models.moving.model import MovingModel, read_canonical
 from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.splatting.rotations import as_if_unit
 
 # Frequencies of the embeddings (utils/time_utils.py): 3 + 2·3·10 = 63 numbers for a position, 1 + 2·10 = 21 for a time.
 POSITION_FREQUENCIES, TIME_FREQUENCIES = 10, 10
@@ -147,11 +148,7 @@ def move_along_screw(points: Tensor, turns: Tensor, shifts: Tensor) -> Tensor:
 
 def kernel_covariances(quats: Tensor, scales: Tensor) -> Tensor:
     """Covariances [N, 3, 3], world units², as 3DGS's kernel computes them from scales [N, 3] and quaternions wxyz [N, 4], not normalized."""
-    w, x, y, z = quats.unbind(-1)
-    entries = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-               2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-               2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
-    factors = torch.unflatten(torch.stack(entries, -1), -1, (3, 3)) * scales[:, None, :]
+    factors = as_if_unit(quats) * scales[:, None, :]
     return factors @ factors.mT
 
 

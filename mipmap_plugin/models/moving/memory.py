@@ -1,4 +1,4 @@
-"""What a field changes at each moment, kept: evaluating it takes many times as long as drawing the splats."""
+"""A memory of what a field changes at each moment: to evaluate it takes many times as long as to draw the splats."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from mipmap_plugin.process.threads import for_views, side_by_side, side_by_side_
 # What a field adds to each parameter, or multiplies it by, at one moment, by name: [N, ...] each.
 Changes = dict[str, Tensor]
 
-# Bytes that are kept, and the part of a machine's memory that is, where it is more. A moment of a million splats takes 40 to 240 MB.
+# Changes are kept up to this number of bytes, or this part of a machine's memory if that is more. A moment of a million splats takes 40 to 240 MB.
 LIMIT, PART = 1 << 30, 1 / 8
 
 # Splats that are evaluated together: their numbers stay in a processor's cache from layer to layer, which halves the time.
 CHUNK, CHUNK_OF_GPU = 4096, 1 << 16
 
-# Splats and moments by which it is found out how much a field changes over a small distance.
+# Splats and moments at which it is measured how much a field changes over a small distance.
 PROBED, MOMENTS = 1024, (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 class Memory:
-    """A field's changes by means and moment. A model and its copies share it, so that one is evaluated where another was.
+    """A field's changes by means and moment. A model and its copies share it, so that none evaluates what another one has evaluated.
 
-    Of each moment those at the first means of all, which are the base's, are kept, and those at the means that were asked for last. Where there is
-    no room for all, what was found at other means makes some, and then what was found at the base's. Nothing else is forgotten for something new:
-    all moments are asked for in turn, so that each would be forgotten before it is of use.
+    For each moment it keeps the changes at the first means of all, which are the base's, and at the means that were asked for last. Without room for
+    all of them it forgets changes at any other means, and then those at the base's. Nothing else makes room for something new: all moments are asked
+    for in turn, so that each would be forgotten before it is of use.
     """
 
     def __init__(self, evaluate: Callable[[Tensor, float], Changes], limit: float | None = None) -> None:
@@ -41,7 +41,7 @@ class Memory:
         self._known: dict[tuple[bool, float], tuple[Tensor, Changes]] = {}  # by whether it is the base's, and time; with the means
         self._asked: dict[float, threading.Lock] = {}  # by time
         self._lock = threading.Lock()
-        self.seconds, self.evaluations = 0.0, 0  # that moments took, and how many there were
+        self.seconds, self.evaluations = 0.0, 0  # the time that all evaluations took, and their number
 
     def __call__(self, means: Tensor, time: float) -> Changes:
         """The changes at `means` [N, 3], without gradient; not to be changed in place."""
@@ -62,13 +62,13 @@ class Memory:
 
     @torch.no_grad()
     def evaluate(self, means: Tensor, time: float) -> Changes:
-        """The changes at `means` [N, 3], of a part of the splats after the other, on a processor by all threads that views share."""
+        """The changes at `means` [N, 3], evaluated chunk by chunk; on a processor in all threads that views share."""
         chunks = means.detach().split(CHUNK if means.device.type == "cpu" else CHUNK_OF_GPU)
         parts = list(side_by_side(lambda part: self._evaluate(part, time), chunks, for_views()))
         return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
     def keep_rows(self, means: Tensor, rows: Tensor, left: Tensor) -> None:
-        """Know what is known at `means` [N, 3] also of their `rows` [M], which are `left` [M, 3]."""
+        """Keep what is known at `means` [N, 3] for those of their `rows` [M] that are `left` [M, 3], too."""
         with self._lock:
             known = {time: changes for (_, time), (place, changes) in self._known.items() if torch.equal(place, means)}
             for time, changes in known.items():
@@ -76,8 +76,8 @@ class Memory:
 
     @torch.no_grad()
     def slope(self, means: Tensor, distance: float) -> float:
-        """How much farther or less far, relative to it, the field moves splats at this `distance` (world units) from `means` [N, 3]; at most 1 if
-        they only keep together."""
+        """The difference between the field's motions of splats and of places at this `distance` (world units) from them, over that distance: the root
+        mean square over some of the `means` [N, 3] and some moments."""
         some = means.detach()[:: max(1, len(means) // PROBED)]
         beside = some + distance / 3**0.5
         apart = [shift(self.evaluate(beside, time)) - shift(self.evaluate(some, time)) for time in MOMENTS]

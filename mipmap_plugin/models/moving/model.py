@@ -28,9 +28,9 @@ from mipmap_plugin.models.vanilla import VanillaModel
 # Number of views at whose times opacities are evaluated; each costs one pass through the field.
 ENOUGH_MOMENTS = 8
 
-# While splats are adapted, the field is evaluated again where more than this part of them has moved so far that it would move them otherwise by
-# this many target pixels, or has moved by so many target pixels itself. With a fourth of the error a scene of 39,000 splats at x1/4 gains 0.06 dB,
-# for twice as many evaluations.
+# While splats are adapted, the field is evaluated again once more than MOVED_FAR of them have moved so far that it would move them otherwise by
+# MOTION_ERROR target pixels, or have moved by FARTHEST target pixels themselves. With a fourth of the error a scene of 39,000 splats at x1/4 gains
+# 0.06 dB, for twice as many evaluations.
 MOVED_FAR, MOTION_ERROR, FARTHEST = 0.1, 0.2, 1.0
 
 TIMELESS = "a camera without a time shows the moment 0; a cameras.json holds no times, so adaptation then spreads them over its views"
@@ -121,7 +121,7 @@ class MovingModel:
         return gaussians
 
     def reach(self, pixel: float) -> float:
-        """How far splats may move before the field moves them noticeably otherwise, world units. `pixel`: of the target, world units."""
+        """How far splats may move until the field would move them noticeably otherwise. This and `pixel`, a target pixel's size: in world units."""
         slope = self._memory.slope(self.parameters()["means"].detach(), pixel)
         return MOTION_ERROR * pixel / max(slope, MOTION_ERROR / FARTHEST)
 
@@ -141,7 +141,7 @@ class MovingModel:
         return moved
 
     def knows(self, time: float) -> bool:
-        """Whether nothing has to be evaluated for the splats at `time`, 0..1."""
+        """Whether the splats at `time`, 0..1, are known without an evaluation."""
         means = self.parameters()["means"].detach() if self.held is None else self.held
         return all(memory.knows(means, time) for memory in self._memories)
 
@@ -152,7 +152,7 @@ class MovingModel:
         return sum(memory.seconds for memory in self._memories), each
 
     def keep_rows(self, rows: Tensor) -> None:
-        """Take note that of the parameters only these `rows` [M], ascending, are going to be left."""
+        """Be told that only these `rows` [M] of the parameters, ascending, are going to be left."""
         if self.held is not None:
             left = self.held[rows]
             for memory in self._memories:
@@ -217,11 +217,6 @@ class MovingModel:
 def _memories_of(field: Field) -> Sequence[Memory]:
     changes = Memory(lambda means, time: field.changes(means, time))
     return (changes,) if field.slopes is None else (changes, Memory(field.slopes))
-
-
-def moved_to(field: Field, canonical: VanillaModel, time: float) -> Gaussians:
-    """The splats at `time` by an evaluation of the field, whatever is known."""
-    return field.moved(canonical, field.changes(canonical.parameters()["means"].detach(), time))
 
 
 def read_canonical(path: str | Path, iteration: int | None, family: str) -> tuple[VanillaModel, Path]:

@@ -1,0 +1,159 @@
+"""What views show of a scene, and what is wrong with views that show nothing, only a speck, or what no single file suits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from itertools import compress
+from pathlib import Path
+from statistics import fmean
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.adaptation.parallel import in_batches
+from mipmap_plugin.camera import Camera, evenly
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.limits import check_image
+from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.models.contract import row_opacities
+from mipmap_plugin.models.health import units
+from mipmap_plugin.progress import announced
+from mipmap_plugin.render_settings import MIN_ALPHA
+from mipmap_plugin.scenes import unread_cameras
+from mipmap_plugin.scenes.orbits import FRAMED, Orbit
+
+# Views that are looked at to see whether they show anything; and the mean fraction of their splats in front of the near plane that is worth a word.
+# Floaters lie close to cameras, but captures in usual units have no splats there; made ten times smaller they have 2 %, twenty times smaller half.
+LOOKED_AT, TOO_MANY = 16, 0.05
+
+# A scene that no view shows larger than so many px, or than this fraction of a picture's shorter side, is too small to adapt. In views of an orbit it
+# fills nearly all of a picture, unless it has such small units that the near plane keeps cameras farther away than a user's.
+LEAST_PIXELS, LEAST_SHARE = 16, 0.25
+
+# What to do about a scene in units so small that the near plane hides it.
+SCALE_UP = "scale the scene up, with its cameras if it has any"
+
+# What is said where there are no cameras: with those of an object all is well, but those of a capture are a guess, which may cost 10 dB and more.
+ORBITED = (
+    "no cameras are known: views of a generated orbit are adapted to, {told}, and all dB are of such{seems}; "
+    "give the scene's cameras (--cameras)"
+)
+CAPTURE = "; this seems to be a capture, and from where it was photographed is a guess: seen from there it may look worse than its base"
+VIEWED = ", or adapt for what you look at (mipmap-plugin view)"
+
+# Lenses whose focal lengths (px) have a larger ratio need different files, as scales of that ratio do. A ratio of 5 costs a capture 10 of 12 dB.
+UNLIKE = 3.0
+
+# How far a splat is visible, in standard deviations; and the distance that views of an orbit keep from a scene, in near planes.
+SEEN, CLEAR = 3, 2
+
+
+@announced("examining views")
+def showing(views: Sequence[Camera], means: Tensor, near: float) -> list[Camera]:
+    """The views that show one of the `means` [N, 3], farther than the near plane (world units)."""
+    shown = [inside.any(1) for inside in _inside(views, means, near)]
+    return list(compress(views, torch.cat(shown).tolist())) if shown else []
+
+
+def _inside(views: Sequence[Camera], means: Tensor, near: float) -> Iterator[Tensor]:
+    """Which `means` [N, 3] lie in the pictures of views, farther than the near plane: [V, N] bool for each batch of views."""
+    for view in in_batches(views, means):
+        yield view.in_picture(view.to_camera(means.detach()), near)
+
+
+@announced("examining views")
+def refuse_blind(views: Sequence[Camera], model: SplatModel, near: float, image_of: Callable[[Camera], Tensor], scale: float = 1.0) -> None:
+    """Raise SettingsError if the views show nothing, or a speck: the cameras may be of another scene, or no renderer draws the splats, for example.
+
+    `near`: the near plane, in world units; `image_of`: a view's image [h, w, 3]; `scale`: the one adapted to, since a zoom-in makes specks large.
+    """
+    some, means = evenly(views, LOOKED_AT), model.parameters()["means"]
+    if not showing(some, means, near):  # a few of many cameras may see what is left of a scene that was cut down
+        some = evenly(showing(views, means, near), LOOKED_AT) or some
+    if any(_draws(view, model, near) for view in some):
+        if small := too_small(views, model, near, min(LEAST_PIXELS, LEAST_SHARE * min(views[0].size)) / max(1.0, scale)):
+            raise SettingsError(small)
+        return
+    if all(torch.equal(image, image[:1, :1].expand_as(image)) for image in map(image_of, some)):  # nor a splat whose center lies outside
+        wrong = "the cameras seem to be of another scene, or in other coordinates; give those of this scene"
+        if showing(some, means, near):
+            wrong = "all splats in view have an opacity below 1/255 and are never drawn; the training or the export failed"
+        elif showing(some, means, 0.0):
+            wrong = f"all splats lie nearer than {near:g} units, where renderers of 3DGS draw none; {SCALE_UP}"
+        raise SettingsError(f"none of the {len(views)} views shows a splat: {wrong}")
+
+
+def _draws(view: Camera, model: SplatModel, near: float) -> bool:
+    """Whether a row of the parameters that is opaque enough to be drawn lies in the view's picture, farther than the near plane."""
+    inside = view.in_picture(view.to_camera(model.parameters()["means"].detach()), near)
+    return bool(inside.any()) and bool((row_opacities(model, [view])[inside] >= MIN_ALPHA).any())
+
+
+def refuse_large(views: Sequence[Camera], model: SplatModel, scale: float) -> None:
+    """Raise SettingsError if the memory cannot hold the largest image that is adapted to."""
+    largest = max(views, key=lambda camera: camera.width * camera.height).zoomed(scale)
+    check_image(largest.width, largest.height, model.parameters()["means"].device)
+
+
+def too_unlike(views: Sequence[Camera]) -> str:
+    """That lenses differ so much that no file fits all of them, in a sentence; "" if they do not."""
+    shortest, longest = (pick(math.sqrt(view.fx * view.fy) for view in views) for pick in (min, max))
+    if longest <= UNLIKE * shortest:
+        return ""
+    where = f"focal lengths of the cameras are {shortest:.0f} to {longest:.0f} px, and what looks right through one does not through another"
+    return f"{where}; adapt with the cameras of each lens on their own"
+
+
+def too_near(views: Sequence[Camera], means: Tensor, near: float) -> str:
+    """How many of the splats with these `means` [N, 3] in a view's picture are not drawn because they are too near, in a sentence; "" if few.
+
+    `near`: the near plane, in world units.
+    """
+    some = evenly(views, LOOKED_AT)
+    counts = [torch.cat([inside.sum(1) for inside in _inside(some, means, plane)]).tolist() for plane in (0.0, near)]
+    lost = [1 - drawn / count for count, drawn in zip(*counts, strict=True) if count]
+    if not lost or fmean(lost) <= TOO_MANY:
+        return ""
+    where = f"{fmean(lost):.0%} of the splats in a view's picture lie nearer than {near:g} units"
+    return f"{where}, where renderers of 3DGS draw none; {SCALE_UP}"
+
+
+def too_small(views: Sequence[Camera], model: SplatModel, near: float, least: float) -> str:
+    """That no view shows the scene `least` px large, in a sentence; "" if one does. `near`: the near plane, in world units.
+
+    A scene of no more splats than it has pixels is as small as it looks: in other units its splats would be smaller than pixels.
+    """
+    splats = model.gaussians(views[0]).detach()
+    if len(splats) == 0:
+        return ""
+    center = splats.means.median(dim=0).values
+    reach = (splats.means - center).norm(dim=1) + SEEN * splats.scales.abs().amax(1)
+    width = 2 * float(reach.kthvalue(max(1, round(FRAMED * len(reach)))).values)
+    middle = center.tolist()
+    most = max(width * view.fx / max(math.dist(view.center.tolist(), middle), near) for view in views)
+    if not most < least:
+        return ""
+    wrong = "the cameras seem to be in other units; give those of this scene"
+    if max(view.fx for view in views) * width / least < width / 2 + CLEAR * near:
+        wrong = f"renderers of 3DGS draw nothing nearer than {near:g} units; {SCALE_UP}"
+    elif len(splats) <= most**2:
+        return ""
+    return f"the scene is {units(width, 2)} units wide, and no view shows it larger than {units(most, 2)} px: {wrong}"
+
+
+def orbited(source: Path | None, orbit: Orbit) -> str:
+    """What is said of views of an orbit: `ORBITED`, with the cameras.json that lies beside the file of the splats."""
+    file, whole = unread_cameras(source), not orbit.nearest
+    beside = f", such as {file}, if it is of this scene" if file else ""
+    others = ("" if whole else VIEWED) + ("" if orbit.up else ", or say what is up (--up z, for one)")
+    return f"{ORBITED.format(told=orbit.told(), seems='' if whole else CAPTURE)}{beside}{others}"
+
+
+@announced("examining views")
+def remarks(views: Sequence[Camera], model: SplatModel, near: float, *, orbit: bool) -> list[str]:
+    """What is wrong with a scene in views that show something, in sentences. `near`: the near plane, in world units; `orbit`: they were generated."""
+    least = LEAST_SHARE * min(views[0].size)
+    least = least if orbit else min(LEAST_PIXELS, least)
+    found = too_near(views, model.parameters()["means"], near), too_small(views, model, near, least)
+    return [sentence for sentence in found if sentence]
