@@ -43,19 +43,19 @@ def make_levels(base: FrozenBase, request: LadderRequest, resume: str | Path | N
 
     Raises SettingsError for a model that no viewer draws, for views that show nothing and for a group of viewers, BackendUnavailable, Interrupted.
     """
+    folder = None if resume is None else path_of(resume, "resume")
     if reason := why_no_viewer(base.model):
         raise SettingsError(f"{base.model.family}: {reason}; levels are files for viewers, so adapt it to one scale at a time")
     base.refuse_undrawn()
     if by_distance(base, request):
-        return make_levels_by_distance(base, request, resume)
+        return make_levels_by_distance(base, request, folder)
     with threads.limited(base.threads, shared=False):
-        return _make_levels(base, request, resume)
+        return _make_levels_by_zoom(base, request, folder)
 
 
-def _make_levels(base: FrozenBase, request: LadderRequest, resume: str | Path | None) -> Ladder:
-    """`make_levels` by zoom."""
+def _make_levels_by_zoom(base: FrozenBase, request: LadderRequest, resume: Path | None) -> Ladder:
     band = request.first_band(base.target(request.viewer), base.effects())
-    store = LevelStore(None if resume is None else path_of(resume, "resume"), base, request)
+    store = LevelStore(resume, base, request)
     with announced("rendering the base"):
         yardstick = Yardstick(base, request.seed)
     work = _Work(base, request, store, yardstick)

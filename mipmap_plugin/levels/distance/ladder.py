@@ -36,14 +36,14 @@ CHUNK = 0.5
 REPEATED = "nothing was better than the finer level as it is"
 
 
-def make_levels_by_distance(base: FrozenBase, request: LadderRequest, resume: str | Path | None = None) -> Ladder:
+def make_levels_by_distance(base: FrozenBase, request: LadderRequest, resume: Path | None = None) -> Ladder:
     """Make the levels. `resume`: as for `levels.ladder.make_levels`. Raises what that raises, and SettingsError for a model whose splats cannot be
     merged, or for settings that levels by distance do not have."""
     refuse(base, request)
     band = request.first_band(base.target(request.viewer), base.effects())
     with announced("cutting the scene into chunks"):
         scene = scene_of(base, request, band)
-        store = LevelStore(None if resume is None else Path(resume), base, request)
+        store = LevelStore(resume, base, request)
     first = store.level("level_0", lambda state: _first(base, request, band, state))
     with threads.limited_for(scene.backend, base.threads):
         levels = [first]
