@@ -221,7 +221,7 @@ def main(
     for path in only or BASES:
         base, name = wrap_model(data / "checkpoints" / path, threads=1), Path(path).name
         request = LadderRequest(VIEWER, coarsest=COARSEST)
-        scene = scene_of(base, request, request.first_band(base.target(VIEWER), base.effects()))
+        scene = scene_of(base, request, request.first_band(base))
         walked = walks(scene)
         with tempfile.TemporaryDirectory() as folder:
             shown = mixtures(scene, base, ladders, name, Path(folder))

@@ -124,7 +124,7 @@ def _ends_at_once(wrapped: Wrapped, request: LadderRequest) -> str:
         return ""  # and no ladder
     if request.until_splats is not None and len(wrapped.model.parameters()["means"]) <= request.until_splats:
         return "--until-splats"
-    band = request.first_band(wrapped.target(request.viewer), wrapped.effects())
+    band = request.first_band(wrapped)
     return "--coarsest" if band.reaches(request.coarsest) else ""
 
 
