@@ -38,9 +38,9 @@ from mipmap_plugin.levels.distance.mixture import Mixture
 from mipmap_plugin.levels.distance.rule import DistanceRule
 from mipmap_plugin.levels.distance.scene import Scene
 from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground
-from mipmap_plugin.levels.manifest import MANIFEST
+from mipmap_plugin.levels.manifest import CANVAS, MANIFEST
 from mipmap_plugin.levels.request import LadderRequest
-from mipmap_plugin.levels.streamed import CANVAS, distances, progression
+from mipmap_plugin.levels.streamed import distances, progression
 from mipmap_plugin.models.places import REPORT, state_path
 from mipmap_plugin.scenes.trajectories import jittered
 from mipmap_plugin.wrap import Wrapped

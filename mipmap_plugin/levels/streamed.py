@@ -26,14 +26,11 @@ from mipmap_plugin.formats.splat_transform import LOD_META
 from mipmap_plugin.formats.streamed_sog import Chunk, read_chunks, write_streamed_sog
 from mipmap_plugin.levels.distance.chunks import shrunk
 from mipmap_plugin.levels.exported import readable
-from mipmap_plugin.levels.manifest import read_manifest
+from mipmap_plugin.levels.manifest import CANVAS, read_manifest
 
 STREAMED, SETTINGS = "streamed", "playcanvas.json"
 
 SINGLE_LEVEL = "this ladder has a single level, which needs no streaming"
-
-# px: the shorter side of the canvas that distances are computed for.
-CANVAS = 1080
 
 # The part of the distance of the first switch that a chunk may extend over, so that its near and far end are seen at nearly one zoom.
 EXTENT = 1 / 4
