@@ -70,8 +70,8 @@ def _wheel() -> Capsules:
     """An upright bicycle wheel with crossed spokes."""
     center = torch.tensor([0.0, 0.08, 0.62])
 
-    def upright(points: Tensor, radius: float, depth: float = 0.0) -> Tensor:
-        return center + radius * points[:, [0, 2, 1]] + torch.tensor([0.0, depth, 0.0])
+    def upright(points: Tensor, radius: float) -> Tensor:
+        return center + radius * points[:, [0, 2, 1]]
 
     ring, spokes = _arc(0, 360, 73), _arc(0, 345, 24)
     lean = torch.tensor([-0.05, 0.05]).repeat(12)[:, None] * torch.tensor([0.0, 1.0, 0.0])

@@ -93,7 +93,7 @@ def viewer_settings(manifest: dict[str, Any], chunks: Sequence[Chunk], canvas: i
     }
 
 
-def write_streamed(folder: Path, canvas: int = CANVAS, *, overwrite: bool = False) -> Path:
+def write_streamed(folder: Path, canvas: int = CANVAS) -> Path:
     """Write Streamed SOG and the viewer's settings to the subfolder `streamed` of a ladder; return its lod-meta.json.
 
     Raises SettingsError without splat-transform and for a single level, OutputExists, OutputError.
@@ -104,7 +104,7 @@ def write_streamed(folder: Path, canvas: int = CANVAS, *, overwrite: bool = Fals
         raise SettingsError(f"{folder}: {SINGLE_LEVEL}; open its level as it is")
     if rising[0] < NEAREST:
         warnings.warn(TOO_SMALL.format(least=NEAREST, first=rising[0]), stacklevel=2)
-    with new_folder(folder / STREAMED, overwrite) as temporary, TemporaryDirectory(prefix=TEMPORARY) as copies:
+    with new_folder(folder / STREAMED, overwrite=False) as temporary, TemporaryDirectory(prefix=TEMPORARY) as copies:
         made = temporary / LOD_META
         extent = manifest.get("chunk_extent", max(1, round(EXTENT * rising[0])))
         files = [level["file"] for level in manifest["levels"]]
