@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from mipmap_plugin.commands.common import print_facts, scene, without_none, wrap
+from mipmap_plugin.commands.common import print_json, scene, without_none, wrap
 from mipmap_plugin.commands.many import NO_CHECKPOINT, Many, Request, adapt_many, jobs_of
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.pages import AdaptationPage, look_at
@@ -89,7 +89,7 @@ def adapt(
     """
     settings, base = without_none(**vars(changes)) | dict(recipe=recipe, seed=seed), Base(Path(), cameras, background, backend, screen_filter, up)
     if many.tiles is not None or many.asked(checkpoints):
-        _refuse_for_many(many.holds(checkpoints), scale, bytes, report)
+        _refuse_for_many(bool(checkpoints or many.list), scale, bytes, report)
         request = Request(_requests(scale, viewer), output, settings | without_none(most_splats=splats), images, overwrite)
         adapt_jobs = adapt_many if many.tiles is None else adapt_tiled
         return adapt_jobs(many, checkpoints, request, base, threads, json)
@@ -107,7 +107,7 @@ def adapt(
     if page:
         page.write(made, [*before.values()])
     if json:
-        print_facts([before.get(file[:2]) or made.pop(0) for file in files], json)
+        print_json([before.get(file[:2]) or made.pop(0) for file in files])
     elif page:
         say(look_at(page.path))
 

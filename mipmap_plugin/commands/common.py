@@ -65,11 +65,13 @@ def without_none(**options: Any) -> dict[str, Any]:
     return {name: value for name, value in options.items() if value is not None}
 
 
-def print_facts(facts: Any, as_json: bool) -> None:
-    """Print facts by name, or as JSON, which is printed quiet or not."""
-    if as_json:
-        put(json_text(facts))
-        return
+def print_json(facts: Any) -> None:
+    """Print facts as JSON, quiet or not."""
+    put(json_text(facts))
+
+
+def print_facts(facts: dict[str, Any]) -> None:
+    """Print facts, each behind its name; of a list each entry on a line of its own."""
     for name, value in facts.items():
         lines = value if isinstance(value, list) else [value]
         hanging = None if name == "file" else KEY + 2 * (len(lines) > 1)  # a path is copied; of several entries each is seen to begin

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mipmap_plugin.commands.common import print_facts
+from mipmap_plugin.commands.common import print_json
 from mipmap_plugin.commands.pages import LEVELS_PAGE, look_at, write_levels_page
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import MipmapPluginError, OutputError, SettingsError
@@ -131,8 +131,7 @@ def _ends_at_once(wrapped: Wrapped, request: LadderRequest) -> str:
 def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path] = (), json: bool = False) -> None:
     """Print a ladder's manifest, as JSON or in lines."""
     if json:
-        print_facts(manifest, json)
-        return
+        return print_json(manifest)
     lines = _distances(folder, manifest) if manifest.get("by") == "distance" else _zooms(folder, manifest)
     if missed := _below(manifest):
         lines.append(f"  {', '.join(missed)}: below the {manifest['least_db']:g} dB that were asked for, in the narrowest band that is tried")

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mipmap_plugin.commands.common import print_facts
+from mipmap_plugin.commands.common import print_json
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import JobsFailed, SettingsError, install
@@ -47,10 +47,6 @@ class Many:
         """Whether these are jobs, rather than one checkpoint."""
         options = (self.jobs, self.dask, self.shard)
         return self.is_list(checkpoints) or self.skip_existing or any(each is not None for each in options)
-
-    def holds(self, checkpoints: Sequence[Path]) -> bool:
-        """Whether there is a checkpoint at all, or a list of them."""
-        return bool(checkpoints) or self.list is not None
 
     def is_list(self, checkpoints: Sequence[Path]) -> bool:
         """Whether there may be several checkpoints, so that an output is a folder for all."""
@@ -187,7 +183,7 @@ def _print(outcomes: Sequence[Outcome], jobs: Sequence[Job], json: bool) -> None
     """The outcomes in the order of their jobs, whatever the order in which they ended."""
     sorted_outcomes = in_order(outcomes, jobs)
     if json:
-        print_facts(facts(sorted_outcomes), json)
+        print_json(facts(sorted_outcomes))
         return
     say(table(sorted_outcomes))
     say(totals(outcomes, len(jobs)))

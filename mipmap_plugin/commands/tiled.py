@@ -6,7 +6,7 @@ from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mipmap_plugin.commands.common import print_facts
+from mipmap_plugin.commands.common import print_json
 from mipmap_plugin.commands.many import Many, Request, engine, jobs_of
 from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.errors import SettingsError
@@ -42,7 +42,7 @@ def adapt_tiled(many: Many, given: Sequence[Path], request: Request, base: Base,
         again = " with --skip-existing" if len(jobs) > 1 and not skip else ""
         raise KeyboardInterrupt(f"interrupted; run the same command again{again} to go on where it stopped") from interrupt
     if json:
-        print_facts([reports[job.target] for job in jobs], json)
+        print_json([reports[job.target] for job in jobs])
 
 
 def _finished(jobs: Sequence[Job], json: bool) -> dict[Path, dict[str, Any]]:
