@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -108,6 +108,19 @@ def jobs_of(checkpoint: Path, request: Request, base: Base, *, several: bool) ->
         target = adapted_path(checkpoint, request.output, scale, viewer, several=several).absolute()
         jobs.append(Job(own, target, scale, viewer, recipe, settings, images, request.overwrite))
     return jobs
+
+
+def finished_before(jobs: Iterable[Job], json: bool, *, may_load: bool = True) -> dict[Path, dict[str, Any]]:
+    """The reports of outputs that an earlier command has made, by the job's target; each output is named unless JSON is printed.
+
+    `may_load`: whether a base may be loaded to find that out (`jobs.finished`).
+    """
+    from mipmap_plugin.jobs.finished import finished
+
+    found = {job.target: before for job in jobs if (before := finished(job, may_load=may_load))}
+    for file, _ in found.values() if not json else ():
+        say(f"{file}: finished before")
+    return {target: {"file": str(file), **report} for target, (file, report) in found.items()}
 
 
 def _checkpoints(given: Sequence[Path]) -> list[Path]:
