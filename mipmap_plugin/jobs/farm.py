@@ -29,7 +29,7 @@ from mipmap_plugin.jobs.finished import finished
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.parcel import Delivery, Parcel, do_parcel, pack, unpack
 from mipmap_plugin.jobs.worker import Worker, do
-from mipmap_plugin.progress import note
+from mipmap_plugin.progress import meanwhile, note
 
 PACKAGE = "mipmap-plugin"
 
@@ -152,15 +152,14 @@ def _task(sent: Job | Parcel, threads: int | None, stop_name: str) -> Outcome | 
 @contextmanager
 def _stopped_by(stop: Event, worker: Worker) -> Iterator[None]:
     """Inside, the worker is stopped once `stop` is set."""
-    ended = threading.Event()
 
-    def watch() -> None:
+    def watch(ended: threading.Event) -> None:
         while not ended.wait(PERIOD_S):
             with suppress(OSError, asyncio.TimeoutError):  # a scheduler that cannot be reached now
                 if stop.is_set():
                     return worker.stop()
 
-    with _beside(watch, ended):
+    with meanwhile(watch):
         yield
 
 
@@ -203,9 +202,8 @@ def _kept_workers(client: Client, place: str, forsaken: Callable[[], object]) ->
 
     dask does so itself, but for a worker that dies while it starts.
     """
-    ended = threading.Event()
 
-    def watch() -> None:
+    def watch(ended: threading.Event) -> None:
         looks = 0
         while not ended.wait(LOOK_S):
             if client.cluster is not None:
@@ -217,20 +215,8 @@ def _kept_workers(client: Client, place: str, forsaken: Callable[[], object]) ->
                 if looks == 2:
                     note(f"--dask {place}: there are no workers, so nothing is done until one comes; Ctrl-C ends this, and the same command goes on")
 
-    with _beside(watch, ended):
+    with meanwhile(watch):
         yield
-
-
-@contextmanager
-def _beside(watch: Callable[[], None], ended: threading.Event) -> Iterator[None]:
-    """Inside, `watch` runs in a thread of its own, until `ended` is set."""
-    watcher = threading.Thread(target=watch, daemon=True)
-    watcher.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        watcher.join()
 
 
 @contextmanager
