@@ -25,7 +25,6 @@ from mipmap_plugin.pages.gallery import Gallery
 from mipmap_plugin.pages.html import write_page
 from mipmap_plugin.pages.reports import evaluation_page
 from mipmap_plugin.process import threads
-from mipmap_plugin.process.threads import side_by_side
 from mipmap_plugin.progress import announced
 from mipmap_plugin.scenes import read_cameras
 from mipmap_plugin.wrap import Wrapped, wrap_model
@@ -122,7 +121,7 @@ def judged_views(base: Wrapped, scale: float) -> list[WorldView]:
         cameras = [camera.window(round(camera.width * MIDDLE), round(camera.height * MIDDLE)) for camera in cameras]
     views = [WorldView(camera) for camera in cameras]
     with announced(f"ray-tracing the truth x{scale:g}"), threads.limited(None, shared=True):
-        list(side_by_side(lambda view: view.truth(scale, PROTOCOL), views, threads.for_views()))
+        list(threads.side_by_side(lambda view: view.truth(scale, PROTOCOL), views, threads.for_views()))
     return views
 
 
