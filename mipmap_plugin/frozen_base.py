@@ -31,7 +31,7 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects, as_outputs
 from mipmap_plugin.errors import BackendUnavailable, SettingsError
 from mipmap_plugin.formats.atomic import named, refuse_output, refuse_unwritable
-from mipmap_plugin.formats.splat_transform import refuse_unread
+from mipmap_plugin.formats.viewer_formats import refuse_unread
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_image, check_kinds, check_names, check_scale, path_of
 from mipmap_plugin.models.base import Filtered, SplatModel, TrainedScale, checked_splats, tensors_of, why_no_viewer

@@ -16,7 +16,7 @@ from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError, OutputError, OutputExists, SettingsError
 from mipmap_plugin.formats import glb
 from mipmap_plugin.formats.gltf import read_gltf
-from mipmap_plugin.formats.splat_transform import refuse_unread
+from mipmap_plugin.formats.viewer_formats import refuse_unread
 from mipmap_plugin.models import detect, load_model
 from mipmap_plugin.models.adapted_name import adapted_name
 from mipmap_plugin.splatting.harmonics import basis

@@ -10,7 +10,6 @@ import re
 import shutil
 import subprocess
 import tempfile
-import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -31,15 +30,15 @@ EXCHANGE = {
     "compressed": ("compressed PLY", ".compressed.ply"),
 }
 
-# Suffixes of the formats that are written: by it, but for GLB (`formats.glb`) and SOG (`formats.sog`), which it reads back.
+# Suffixes of the formats that are written. splat-transform writes them, except GLB (`formats.glb`) and SOG (`formats.sog`), which it only reads back.
 WRITTEN = (".spz", ".sog", ".compressed.ply", ".glb")
 READ_ONLY = tuple(ending for _, ending in EXCHANGE.values() if ending not in WRITTEN)
 
-# Suffix -> the oldest version of splat-transform that is needed: of a lod-meta.json, one that has the options of `streamed_sog`; of a SOG, which
-# `formats.sog` writes, the oldest that was seen to read it back.
+# The oldest version of splat-transform that is needed to write a file, by its suffix: of a lod-meta.json, one that has the options of `streamed_sog`;
+# of a SOG, the oldest that was seen to read back what `formats.sog` writes.
 OLDEST: dict[str, tuple[int, ...]] = {".sog": (2, 7), ".json": (3, 0), ".spz": (2, 1)}
 
-# A ladder of SOGs, which viewers stream, and the oldest version of splat-transform that reads it, also as older ones wrote it: its finest level.
+# The file of a ladder of SOGs, which viewers stream, and the oldest version of splat-transform that reads its finest level.
 LOD_META, OLDEST_FOR_STREAMED = "lod-meta.json", (3, 2)
 
 # The last version of SPZ that Spark 2.2 reads, and the first that splat-transform can write; its own choice is 4.
@@ -48,32 +47,11 @@ SPZ_VERSION = "3"
 # The highest SH degree that its versions from 3.0 on read and write, though SPZ itself has room for 4.
 MOST_BANDS = 3
 
-# Viewers that do not read it, by their source: for these a PLY has to be written. "classic" and "antialiased" are names for whatever draws as 3DGS
-# does, and some of that reads it.
-NO_SPZ = {
-    "gaussian-splats-3d": "GaussianSplats3D 0.4.7 reads .spz up to version 2, and splat-transform writes 3 at least",
-    **dict.fromkeys(("antimatter15", "aframe", "gsplat-js"), "antimatter15/splat, aframe-gaussian-splatting and gsplat.js read no .spz"),
-    "mip": "Mip-Splatting reads PLYs only, with a column filter_3D that .spz has no place for",
-    "kiri": "KIRI's add-on for Blender reads PLYs only",
-}
-
-# Viewers that read a .glb as it is written here, and names for whatever draws as 3DGS does: three.js by an extension of its loader, Babylon.js by the
-# package of its loaders. And viewers that do not, by their source; of others neither is known.
-READ_GLB = ("playcanvas", "playcanvas-webgpu", "playcanvas-aa", "three", "babylon", "classic", "antialiased")
-NO_GLB = {
-    **{
-        viewer: f"{viewer} reads no splats in glTF"
-        for viewer in ("spark", "gaussian-splats-3d", "gsplat-js", "antimatter15", "aframe", "mip", "brush", "lichtfeld", "web-splat",
-                       "visionary", "metalsplatter", "vk-gaussian-splatting", "splatapult", "gdgs", "3dgs.cpp", "kiri")
-    },
-    "cesium": "Cesium draws no splats in glTF but SPZ, as levels --tiles writes them",
-}  # fmt: skip
-
 # From 2.1 until 3.0, splat-transform turned splats by half a turn about x when it read SPZ and when it wrote it; before and since, it leaves them
 # in the frame in which they are stored.
 TURNS_SPZ = ((2, 1), (3, 0))
 
-# Suffixes of other files: who asks for one does not expect a folder of that name.
+# Suffixes of other kinds of files. A model is not written to a folder with such a name: whoever gives it expects a file.
 OF_FILES = (".pt", ".pth", ".ckpt", ".npz", ".npy", ".glb", ".gltf", ".obj", ".usd", ".usdz", ".html", ".json", ".csv", ".txt", ".zip", ".png")
 
 TOOL = "splat-transform"
@@ -98,18 +76,6 @@ def refuse_exchange(path: Path) -> list[str]:
     if reason := _too_old(tool, oldest):
         raise SettingsError(f"{path}: {reason}; or {'leave Streamed SOG out' if path.name == LOD_META else 'give a .ply'}")
     return tool
-
-
-def refuse_unread(path: Path, viewers: Sequence[str]) -> None:
-    """Raise SettingsError for an output that none of the viewers it is made for reads; warn of one that only some of them read."""
-    unread = NO_GLB if is_glb(path) else NO_SPZ if _is_spz(path) else {}
-    reasons = {viewer: unread[viewer] for viewer in viewers if viewer in unread}
-    if not reasons:
-        return
-    advice = f"{path}: {'; '.join(dict.fromkeys(reasons.values()))}; give a .ply by --output"
-    if len(reasons) == len(viewers):
-        raise SettingsError(advice)
-    warnings.warn(f"{advice} if it is for these too", stacklevel=3)
 
 
 def _too_old(tool: Sequence[str], oldest: Sequence[int]) -> str:
@@ -242,7 +208,7 @@ def find_tool() -> list[str] | None:
 
 def _run(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str:
     """Run splat-transform. Returns its error message, empty on success."""
-    options = ["--gpu", "cpu", *(["--spz-version", SPZ_VERSION] if _is_spz(target) else [])]
+    options = ["--gpu", "cpu", *(["--spz-version", SPZ_VERSION] if is_spz(target) else [])]
     command = [*tool, "--quiet", "--overwrite", *options, *map(str, inputs), str(target)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=LONGEST, check=False)
@@ -257,7 +223,7 @@ def _run(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str
 
 def _settle_frame(tool: Sequence[str], file: Path, ply: Path) -> None:
     """Turn the splats of a PLY that were, or will be, turned on their way from or to `file`."""
-    if _is_spz(file) and TURNS_SPZ[0] <= _version(tool) < TURNS_SPZ[1]:
+    if is_spz(file) and TURNS_SPZ[0] <= _version(tool) < TURNS_SPZ[1]:
         from mipmap_plugin.formats.half_turn import half_turned  # and NumPy, without which options are read
 
         half_turned(ply)
@@ -287,7 +253,8 @@ def is_glb(path: Path) -> bool:
     return path.name.lower().endswith(".glb")
 
 
-def _is_spz(path: Path) -> bool:
+def is_spz(path: Path) -> bool:
+    """Whether a path is that of an SPZ."""
     return path.name.lower().endswith(".spz")
 
 

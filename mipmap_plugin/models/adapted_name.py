@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from mipmap_plugin.errors import MipmapPluginError
-from mipmap_plugin.formats.splat_transform import EXCHANGE, READ_GLB, READ_ONLY, WRITTEN
+from mipmap_plugin.formats.splat_transform import EXCHANGE, READ_ONLY, WRITTEN
+from mipmap_plugin.formats.viewer_formats import READ_GLB
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.families import BUILT_IN, find_family
 from mipmap_plugin.models.family import Files

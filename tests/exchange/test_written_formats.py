@@ -17,7 +17,7 @@ from mipmap_plugin.cli import main
 from mipmap_plugin.commands.ladders import Exports
 from mipmap_plugin.errors import OutputError, SettingsError
 from mipmap_plugin.formats.ply import read_ply
-from mipmap_plugin.formats.splat_transform import refuse_unread
+from mipmap_plugin.formats.viewer_formats import refuse_unread
 from mipmap_plugin.levels.tiles import write_tile
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
