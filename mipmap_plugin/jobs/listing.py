@@ -47,7 +47,7 @@ def _matches(pattern: Path) -> list[Path]:
 
 
 def without_outputs(checkpoints: Iterable[Path]) -> tuple[list[Path], list[Path]]:
-    """The checkpoints that no adaptation has made, and the others, which a pattern such as output/* finds too once there are outputs."""
+    """Separate checkpoints from outputs of adaptations, which a pattern such as output/* also finds: both lists."""
     kept: list[Path] = []
     left_out: list[Path] = []
     for path in checkpoints:

@@ -127,7 +127,7 @@ def _scene(path: Path, folder: Path) -> dict[Path, Path]:
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """All files below a folder, also in links to folders, as photographs often are, but not in those to where they lie in."""
+    """All files below a folder. Links to folders are followed, as photographs often are behind one, but not links to a folder around them."""
     for entry in sorted(folder.iterdir()):
         if entry.is_file():
             yield entry
