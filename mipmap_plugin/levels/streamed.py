@@ -32,7 +32,7 @@ STREAMED, SETTINGS = "streamed", "playcanvas.json"
 
 SINGLE_LEVEL = "this ladder has a single level, which needs no streaming"
 
-# The part of the distance of the first switch that a chunk may extend over, so that its near and far end are seen at nearly one zoom.
+# The largest extent of a chunk, as a part of the distance of the first switch: its near and its far end are then seen at nearly one zoom.
 EXTENT = 1 / 4
 
 # The splats that PlayCanvas shows at most.
