@@ -41,7 +41,7 @@ class Changes:
     steps: int | None = None
     """Maximum number of optimizer steps."""
     time_budget_s: float | None = None
-    """Maximum number of seconds for each file; with --tiles for each tile instead, one after the other without --jobs."""
+    """Maximum number of seconds for each file; with --tiles for each tile, and tiles are adapted one after the other without --jobs."""
     target_db: float | None = None
     """Stop at this PSNR against the pseudo truth (not against photographs)."""
     resize: ResizeFilter | None = None
@@ -82,7 +82,7 @@ def adapt(
         viewer: Viewer to make the file for: classic, spark, ...; portable: all; several: a file each. By default what draws as the training did.
         splats: Maximum number of splats. Without a scale, the file is made for the zoom that so many splats suit.
         bytes: Maximum size of the file, such as 20MB, in place of a number of splats.
-        images: Folder of the scene. A zoom-in is then adapted to its training images, at the resolution of the base, instead of the base's own.
+        images: Folder of the scene. A zoom-in is then adapted to its training images, at the base's resolution, instead of to the base's own.
         report: Also write a page that shows what came out: NAME.report.html beside the file, or in the folder of several files.
         overwrite: Replace outputs that exist.
         json: Print the reports as JSON.

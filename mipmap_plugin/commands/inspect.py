@@ -32,7 +32,7 @@ def inspect(
     Args:
         checkpoint: A PLY or a model folder.
         iteration: Which iteration of a model folder; by default the newest.
-        viewers: Render a few views as web viewers do, and report their PSNR against the renders of the training.
+        viewers: Render a few views as web viewers do, and report their PSNR against renders with the filter of the training.
         all: Also list the effects that are off, with reasons. The JSON always has them.
         json: Print JSON instead of sentences.
     """

@@ -34,14 +34,13 @@ class Many:
     dask: str | None = None
     """Adapt on the workers of dask.distributed: tcp://HOST:8786 for a scheduler, local:4 for four workers of this machine."""
     send_files: bool = False
-    """With --dask: send checkpoints and get files back, also where workers see this disk; by default only where one does not."""
+    """With --dask: send checkpoints to the workers and get files back, also if they see this disk; by default only if one does not."""
     shard: str | None = None
     """Do a part of the jobs only, such as 3/50: every fiftieth, from the third on."""
     skip_existing: bool = False
-    """Do nothing where the output was already made, from the same base with the same settings. Several checkpoints do so by default."""
-
+    """Skip outputs that were already made from the same base with the same settings. With several checkpoints this is the default."""
     tiles: int | None = None
-    """Cut one large checkpoint into so many parts for a zoom-out, each of which is adapted as a job of its own, with less memory."""
+    """Zoom-out of a large checkpoint: cut it into this many parts, each of which is adapted as a job of its own, with less memory."""
 
     def asked(self, checkpoints: Sequence[Path]) -> bool:
         """Whether these are jobs, rather than one checkpoint."""
