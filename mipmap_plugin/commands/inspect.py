@@ -44,13 +44,10 @@ def inspect(
         known = {"file": told(found.path), "family": found.family}
         if not json:
             print_facts(known)  # before torch is imported
-        from mipmap_plugin.models.inria_folder import read_options
-        from mipmap_plugin.scenes import load_scene
         from mipmap_plugin.wrap import wrap_model
 
         model = load_model(checkpoint, iteration=iteration)
-        scene = None if cameras is None else load_scene(cameras, read_options(model.folder)[0])
-        wrapped = wrap_model(model, cameras=scene, screen_filter=screen_filter, up=up)
+        wrapped = wrap_model(model, cameras=cameras, screen_filter=screen_filter, up=up)
     facts = _facts(checkpoint, wrapped, cameras, whole=all or json)
     asked = [note for note in model.notes if "--screen-filter" in note and screen_filter]  # which is answered
     if not json:
