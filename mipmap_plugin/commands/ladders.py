@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import print_json
-from mipmap_plugin.commands.pages import LEVELS_PAGE, look_at, write_levels_page
+from mipmap_plugin.commands.pages import PAGE, look_at, write_levels_page
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import MipmapPluginError, OutputError, SettingsError
 from mipmap_plugin.formats.splat_transform import LOD_META, refuse_exchange
@@ -139,7 +139,7 @@ def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path
     base = min(point["base_db"] for point in manifest["curve"])
     lines.append(f"  at worst {manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} on average; the base alone falls to {base:.1f} dB")
     lines.append(f"  {manifest['measured']}")
-    say("\n".join([*lines, *(look_at(path) if path.name == LEVELS_PAGE else f"  {path}" for path in exports)]))
+    say("\n".join([*lines, *(look_at(path) if path.name == PAGE else f"  {path}" for path in exports)]))
 
 
 def _below(manifest: dict[str, Any]) -> list[str]:
