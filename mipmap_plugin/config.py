@@ -122,7 +122,7 @@ class AdaptConfig(BaseModel):
         default="shuffled", description="Order of the views in each round; `spread`: consecutive views look from different sides."
     )
     warm_up: float = Field(
-        default=0.0, ge=0, le=1, description="Fraction of the steps during which learning rates rise, for as long as validation improves."
+        default=0.0, ge=0, le=1, description="Fraction of the steps during which learning rates rise, until validation shows harm."
     )
     gathering: float = Field(default=0.0, ge=0, le=1, description="Fraction of the run during which new views are introduced; each costs a render.")
     validation_views: int = Field(
