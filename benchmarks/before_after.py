@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 import tyro
 
-from mipmap_plugin.demo.run import PROTOCOL, WorldView, beside_each_other, embedded
+from mipmap_plugin.demo.run import PROTOCOL, WorldView, embedded, shown
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.formats.images import write_image
 
@@ -30,7 +30,7 @@ def main(output: Path = Path("docs/before_after.png"), seed: int = 0) -> None:
         adapted = base.adapt(scale, seed=seed)
         before, after = base.render(camera).image, adapted.render(camera).image
         print(f"x{scale:g}: {psnr(before, truth):.1f} dB as it is, {psnr(after, truth):.1f} dB adapted in {adapted.report.seconds['total']:.0f} s")
-        rows.append(beside_each_other([before, after, truth]))
+        rows.append(shown([before, after, truth]))
     gap = torch.ones(12, rows[0].shape[1], 3)
     write_image(output, torch.cat([rows[0], gap, rows[1]]), overwrite=True)
 

@@ -38,9 +38,9 @@ from mipmap_plugin.levels.distance.mixture import Mixture
 from mipmap_plugin.levels.distance.rule import DistanceRule
 from mipmap_plugin.levels.distance.scene import Scene
 from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground
-from mipmap_plugin.levels.manifest import MANIFEST
+from mipmap_plugin.levels.manifest import CANVAS, MANIFEST
 from mipmap_plugin.levels.request import LadderRequest
-from mipmap_plugin.levels.streamed import CANVAS, distances, progression
+from mipmap_plugin.levels.streamed import distances, progression
 from mipmap_plugin.models.places import REPORT, state_path
 from mipmap_plugin.scenes.trajectories import jittered
 from mipmap_plugin.wrap import Wrapped
@@ -221,7 +221,7 @@ def main(
     for path in only or BASES:
         base, name = wrap_model(data / "checkpoints" / path, threads=1), Path(path).name
         request = LadderRequest(VIEWER, coarsest=COARSEST)
-        scene = scene_of(base, request, request.first_band(base.target(VIEWER), base.effects()))
+        scene = scene_of(base, request, request.first_band(base))
         walked = walks(scene)
         with tempfile.TemporaryDirectory() as folder:
             shown = mixtures(scene, base, ladders, name, Path(folder))

@@ -18,7 +18,7 @@ def _number(value: Any) -> bool:
 
 
 def _steps(value: Any) -> bool:
-    return isinstance(value, tuple) and all(_number(step) and 0 < step <= 1 for step in value)
+    return isinstance(value, tuple) and all(map(STEP[1], value))
 
 
 def _range(value: Any) -> bool:
@@ -30,6 +30,7 @@ POSITIVE: Rule = "a number above 0", lambda value: _number(value) and value > 0
 SIZE: Rule = "a number of at least 0", lambda value: _number(value) and 0 <= value < math.inf
 ANY_SIZE: Rule = "a number of at least 0, or infinity", lambda value: _number(value) and value >= 0
 SHARE: Rule = "a number from 0 to below 1", lambda value: _number(value) and 0 <= value < 1
+STEP: Rule = "a step above 0 and up to 1", lambda value: _number(value) and 0 < value <= 1
 STEPS: Rule = "a tuple of steps above 0 and up to 1", _steps
 
 # Without a least alpha a splat would be as large as the picture; with one of 1 none would be drawn.
@@ -49,7 +50,7 @@ OF_SETTINGS: Mapping[str, Rule] = {
     "frozen_beyond": ANY_SIZE,
     "frame": POSITIVE,
     "linear_light": ("a power from 1 to 4", lambda value: _number(value) and 1 <= value <= 4),
-    "picture_step": ("a step above 0 and up to 1", lambda value: _number(value) and 0 < value <= 1),
+    "picture_step": STEP,
 }
 
 # 24 bits, as many as float32 tells apart.
@@ -60,7 +61,7 @@ OF_EVEN_BUCKETS: Mapping[str, Rule] = {
 
 OF_PACKING: Mapping[str, Rule] = {
     "opacity": STEPS,
-    "color": ("a step above 0 and up to 1", lambda value: _number(value) and 0 < value <= 1),
+    "color": STEP,
     "bands": STEPS,
     "log_scales": ("a minimum, a larger maximum, and a step between them", _range),
     "quats": ("'octahedral' or 'stereographic'", lambda value: value in ("octahedral", "stereographic")),

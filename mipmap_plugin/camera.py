@@ -28,7 +28,6 @@ DIGITS = 16
 # slips (one axis flipped, one stretched, intrinsics multiplied in) are off by far more.
 POSE_TOLERANCE = 3e-2
 
-
 # OpenGL's camera looks along -z with y up, OpenCV's along +z with y down.
 OPENGL_TO_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64, device="cpu"))
 
@@ -100,7 +99,7 @@ class Camera:
         return cls.of_matrices(OPENGL_TO_OPENCV @ torch.linalg.inv(pose), K, width, height, **others)
 
     def _check_view(self) -> None:
-        """Turn what is said of the view into text and numbers of Python. Raises SettingsError."""
+        """Check name, split, time, zoom and index, and convert them to types of Python. Raises SettingsError."""
         if not isinstance(self.name, (str, Path)):
             raise SettingsError(f"camera: name must be a text, got {self.name!r}")
         object.__setattr__(self, "name", str(self.name))
@@ -114,7 +113,7 @@ class Camera:
             raise SettingsError(f"camera {self.name!r}: time must be finite, and zoom a number above 0, got {self.time} and {self.zoom}")
 
     def _check_intrinsics(self) -> None:
-        """Turn the intrinsics into numbers of Python. Raises SettingsError."""
+        """Check the intrinsics and the size, and convert them to types of Python. Raises SettingsError."""
         for name in ("width", "height"):
             object.__setattr__(self, name, self._number(name, index))
         for name in ("fx", "fy", "cx", "cy"):
@@ -125,7 +124,7 @@ class Camera:
             raise SettingsError(f"camera {self.name!r}: image size and focal lengths must be positive and finite, got {got}")
 
     def _with(self, **changes: Any) -> Camera:
-        """A copy with other intrinsics at the same pose, which was checked already: a run makes thousands of such copies."""
+        """A copy with other intrinsics. The pose is not checked again, because a run makes thousands of such copies."""
         camera = copy.copy(self)
         for name, value in changes.items():
             object.__setattr__(camera, name, value)
@@ -133,7 +132,7 @@ class Camera:
         return camera
 
     def _number(self, name: str, kind: Callable[[Any], Any]) -> Any:
-        """One of the intrinsics as a number of Python, from one of NumPy or torch. Raises SettingsError."""
+        """An attribute as a number of Python, also from one of NumPy or torch. Raises SettingsError."""
         value = getattr(self, name)
         try:
             return kind(None if isinstance(value, str) else value)
@@ -142,7 +141,7 @@ class Camera:
             raise SettingsError(f"camera {self.name!r}: {name} must be {what}, got {value!r}") from error
 
     def _pose(self) -> Tensor:
-        """A copy of the pose, which its owner cannot change any more. Raises ShapeError, SettingsError."""
+        """A copy of `viewmat`, so that the caller's tensor can change without changing the camera. Raises ShapeError, SettingsError."""
         pose = _matrix("viewmat", self.viewmat, (4, 4))
         *rows, last = pose.tolist()  # numbers of Python: operations on tensors so small take several times as long
         if not all(map(math.isfinite, (number for row in (*rows, last) for number in row))):
@@ -226,10 +225,8 @@ class Camera:
         """The same view after the whole scene, this camera included, was transformed by `similarity` [4, 4] (rotation, scale, translation)."""
         linear = similarity[:3, :3].to("cpu", torch.float64)
         rotation = linear / torch.linalg.det(linear).abs().pow(1 / 3)
-        viewmat = torch.eye(4, dtype=torch.float64, device="cpu")
-        viewmat[:3, :3] = self.viewmat[:3, :3] @ rotation.T
-        viewmat[:3, 3] = -viewmat[:3, :3] @ (linear @ self.center + similarity[:3, 3].to("cpu", torch.float64))
-        return replace(self, viewmat=viewmat)
+        center = linear @ self.center + similarity[:3, 3].to("cpu", torch.float64)
+        return replace(self, viewmat=viewmat_of(rotation @ self.viewmat[:3, :3].T, center))
 
     def looking_from(self, viewmat: Tensor, name: str) -> Camera:
         """The same intrinsics at another pose."""

@@ -43,7 +43,7 @@ for name, command in COMMANDS.items():
 
 
 def _at_home(word: str) -> str:
-    """A word with "~" as the home folder: shells leave it behind a "=" and in quotes, and that of Windows everywhere."""
+    """Replace "~" at the beginning of a word, or of an option's value. Shells do not after "=" and within quotes, and that of Windows never does."""
     option, equals, value = word.rpartition("=") if word.startswith("--") else ("", "", word)
     return option + equals + os.path.expanduser(value)
 
@@ -79,7 +79,7 @@ def _run(words: Sequence[str]) -> int:
         except KeyboardInterrupt as interrupt:
             voice.complain(f"\nmipmap-plugin: {str(interrupt) or 'interrupted'}")
             return ending.code
-        except BrokenPipeError:  # as of `| head`, whose reader wants no more
+        except BrokenPipeError:  # by `| head`, for example, which has read enough
             return 141
         except MipmapPluginError as error:
             voice.complain(f"mipmap-plugin: {_told(error)}")
@@ -115,7 +115,7 @@ def _show(text: str, said: set[str]) -> None:
 
 
 def _told(words: object) -> str:
-    """What is said of unpacked archives, as said of the archives, for what is unpacked is gone when it is read."""
+    """A message that names archives in place of the temporary folders they were unpacked to, which are gone when it is read."""
     from mipmap_plugin.models.zipped_folder import told
 
     return told(words)

@@ -45,7 +45,9 @@ class AdaptConfig(BaseModel):
     steps: int = Field(default=1000, ge=0, description="Maximum number of optimizer steps.")
     most_steps: int | None = Field(default=None, ge=0, description="Maximum number of steps in a time budget that has room for more than `steps`.")
     most_draws: float | None = Field(
-        default=None, gt=0, description="Fewer steps, a quarter of them at least, if they would draw more splats in all views."
+        default=None,
+        gt=0,
+        description="Maximum number of splats that all steps draw; a run that would draw more takes fewer steps, a quarter of them at least.",
     )
     time_budget_s: float | None = Field(default=None, gt=0, description="Stop after this many seconds.")
     target_db: float | None = Field(
@@ -59,35 +61,35 @@ class AdaptConfig(BaseModel):
     seed: int = Field(default=0, ge=0, le=MAX_SEED, description="Seed of everything random.")
 
     band: tuple[Factor, Factor] = Field(
-        default=(1.0, 1.0), description="Zoom-out: the file is shown from the first to the second multiple of its scale."
+        default=(1.0, 1.0), description="Zoom-out: the file is shown at zooms from the first to the second of these multiples of its scale."
     )
     resize: ResizeFilter = Field(
-        default="pil-bicubic", description="Filter that shrinks images, as that of a protocol; `fitting`: what fits the base."
+        default="pil-bicubic", description="Filter that shrinks images, such as a protocol's; `fitting`: the one that fits the base's own filter."
     )
     upsampler: str = Field(default="bicubic", description="What makes base images larger: a registered name, or the file of a network.")
     compare_at: Literal["target", "base", "both"] = Field(
         default="target", description="Zoom-in: compare with the upsampled base, the base itself, or both."
     )
     detail_weight: float = Field(
-        default=0.1, ge=0, description="`both`: weight of the difference from the upsampled base; that from the base has weight 1."
+        default=0.1, ge=0, description="`both`: weight of the difference from the upsampled base, relative to the difference from the base itself."
     )
     detail_structure: float = Field(
-        default=0.0, ge=0, le=1, description="`both`: fraction of the former that is the difference of structure, 1 - SSIM."
+        default=0.0, ge=0, le=1, description="`both`: fraction of the difference from the upsampled base that is one of structure, 1 - SSIM."
     )
     detail_contrast: float = Field(
-        default=0.0, ge=0, description="`both`: weight in the former of the difference in the strength of local contrasts."
+        default=0.0, ge=0, description="`both`: weight, in the same difference, of how much the strength of local contrasts differs."
     )
-    upsampled_views: int = Field(default=50, gt=0, description="`both`: maximum number of views, each of which is upsampled.")
+    upsampled_views: int = Field(default=50, gt=0, description="`both`: maximum number of views, because each is upsampled.")
     quantize_truth: bool = Field(default=False, description="Round the pseudo truth to 8 bits, as in PNG files.")
     truth_oversampling: int | None = Field(
-        default=None, gt=0, description="Render the base at most this many times finer than the target; None: full size."
+        default=None, gt=0, description="Render the base at most this many times finer than the target; None: at its full size."
     )
 
     views: ViewPolicy = Field(default="jittered", description="Which views to adapt to; `jittered`: the train views and random views around them.")
     moments: int | None = Field(
         default=24,
         gt=0,
-        description="Maximum number of moments of a moving scene that views are adapted at; None, and with photographs: each at its own.",
+        description="Moving scenes: maximum number of moments at which views are adapted. None: each view at its own, as always with photographs.",
     )
     extra_views: int = Field(default=100, ge=0, description="Number of views that `jittered` adds, or that an orbit has.")
 
@@ -99,7 +101,7 @@ class AdaptConfig(BaseModel):
     merging_costs: float = Field(
         default=0.3,
         ge=0,
-        description="Maximum loss of merging in dB on validation views before the first step; for another renderer at least 0.6, unless 0.",
+        description="Maximum loss by merging, in dB on validation views before the first step; at least 0.6, unless 0, for another renderer.",
     )
     most_splats: int | None = Field(default=None, gt=0, description="Merge to at most this many splats, whatever it costs, in place of `merge_to`.")
     rates: LearningRates = LearningRates()
@@ -108,17 +110,19 @@ class AdaptConfig(BaseModel):
     )
     decay: float = Field(default=1.0, gt=0, le=1, description="Fraction of itself that every learning rate decays to, along half a cosine.")
     betas: tuple[Momentum, Momentum] = Field(default=(0.9, 0.999), description="Adam's decay rates of the moments.")
-    nesterov: bool = Field(default=False, description="Adam with Nesterov's momentum: each step counts the newest gradient once more.")
+    nesterov: bool = Field(default=False, description="Adam with Nesterov's momentum.")
     conversion_steps: int = Field(
-        default=0, ge=0, description="Zoom-in for what draws otherwise than the training did: at most so many steps at x1 before."
+        default=0, ge=0, description="Zoom-in for a viewer that draws otherwise than the training did: maximum number of steps at x1 that come first."
     )
-    least_zoom_in: float = Field(default=1.0, ge=1, description="No steps are taken at a zoom-in below this for what draws as the training did.")
+    least_zoom_in: float = Field(
+        default=1.0, ge=1, description="Zoom-in: no steps are taken below this scale, unless the viewer draws otherwise than the training did."
+    )
     views_per_step: int = Field(default=1, gt=0, description="Views whose gradients are summed for one step.")
     order: Literal["shuffled", "spread"] = Field(
-        default="shuffled", description="Order of the views in each round; `spread`: neighbors look from all sides."
+        default="shuffled", description="Order of the views in each round; `spread`: consecutive views look from different sides."
     )
     warm_up: float = Field(
-        default=0.0, ge=0, le=1, description="Fraction of the steps during which learning rates rise, as far as validation allows."
+        default=0.0, ge=0, le=1, description="Fraction of the steps during which learning rates rise, until validation shows harm."
     )
     gathering: float = Field(default=0.0, ge=0, le=1, description="Fraction of the run during which new views are introduced; each costs a render.")
     validation_views: int = Field(

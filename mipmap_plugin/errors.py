@@ -54,6 +54,10 @@ class OutputExists(MipmapPluginError, FileExistsError):
     """An output that exists already and must not be overwritten."""
 
 
+class JobsFailed(MipmapPluginError):
+    """Some of many jobs failed; the others are done."""
+
+
 # What the names of temporary folders begin with.
 TEMPORARY = "mipmap-plugin-"
 
@@ -103,7 +107,3 @@ def unknown(kind: str, name: str, names: Sequence[str]) -> str:
 def brief(error: BaseException) -> str:
     """The first line of another library's error."""
     return (str(error).splitlines() or [type(error).__name__])[0][:120]
-
-
-class JobsFailed(MipmapPluginError):
-    """Some of many jobs failed; the others are done."""

@@ -1,4 +1,4 @@
-"""Limits of requests: scales, seeds, background colors, and images that fit into a machine's memory."""
+"""Checks of arguments: types, names, paths, scales, seeds, background colors, and images that fit into a machine's memory."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ def _module(thing: Any) -> str:
 
 @contextmanager
 def naming(what: str) -> Iterator[None]:
-    """Errors inside, which is third-party code alone, become a PluginError; so does an attempt to end the process. `what`: "backend 'mine'"."""
+    """Turn errors of the block, which runs third-party code only, and its attempts to exit into a PluginError. `what`: such as "backend 'mine'"."""
     try:
         yield
     except (Exception, SystemExit) as error:
@@ -37,7 +37,7 @@ def naming(what: str) -> Iterator[None]:
 
 @contextmanager
 def naming_any(plugins: Mapping[str, Any]) -> Iterator[None]:
-    """Errors that pass through the code of one of the third-party `plugins`, objects by what they are called, become a PluginError."""
+    """Turn errors that pass through the code of a third-party plug-in into a PluginError. `plugins`: objects by what messages call them."""
     try:
         yield
     except (Exception, SystemExit) as error:
@@ -50,7 +50,7 @@ def naming_any(plugins: Mapping[str, Any]) -> Iterator[None]:
 
 
 def _is_of(frame: FrameType, thing: Any) -> bool:
-    """Whether a frame is of a method of an object or of its copies, or of its module; a script may have other things in it, such as an observer."""
+    """Whether a frame runs a method of an object of the same type, or code of its module, unless that is a script, which may hold an observer too."""
     module = frame.f_globals.get("__name__")
     return type(frame.f_locals.get("self")) is type(thing) or (module == _module(thing) and module != "__main__")
 

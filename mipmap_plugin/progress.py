@@ -1,4 +1,4 @@
-"""Long work that has no steps to count says on a terminal what it is and how long it has taken."""
+"""Progress on a terminal: bars for work whose steps are counted, a clock for other long work, and lines above them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PATIENCE, PERIOD = 1.0, 0.5
 
 
 def counted(items: Iterable[Item], total: int, what: str, unit: str) -> Iterator[Item]:
-    """Yield the items, and show on a terminal how many of them there were."""
+    """Yield the items, and show on a terminal how many of them are done."""
     bar = tqdm(items, total=total, desc=what, unit=unit, disable=None)
     with ticking(bar):
         yield from bar
@@ -25,7 +25,7 @@ def counted(items: Iterable[Item], total: int, what: str, unit: str) -> Iterator
 
 @contextmanager
 def told(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
-    """Show on a terminal how many there are of how many, as the function that the block is given is told."""
+    """Show progress on a terminal; the block calls the function that it is given with how many are done, and of how many."""
     with tqdm(desc=what, unit=unit, disable=None) as shown:
 
         def tell(done: int, total: int) -> None:
@@ -43,7 +43,7 @@ def note(line: str) -> None:
 @contextmanager
 def announced(what: str) -> Iterator[None]:
     """Show `what` and its seconds on standard error while the block runs, once it has taken a second; nothing where that is no terminal."""
-    with _meanwhile(lambda ended: _show(what, ended)) if sys.stderr.isatty() else nullcontext():
+    with meanwhile(lambda ended: _show(what, ended)) if sys.stderr.isatty() else nullcontext():
         yield
 
 
@@ -55,21 +55,21 @@ def ticking(bar: tqdm) -> Iterator[None]:
         while not ended.wait(PATIENCE):
             bar.refresh()
 
-    with nullcontext() if bar.disable else _meanwhile(refresh):
+    with nullcontext() if bar.disable else meanwhile(refresh):
         yield
 
 
 @contextmanager
-def _meanwhile(show: Callable[[threading.Event], None]) -> Iterator[None]:
-    """Call `show` in a thread of its own, which is to return when the event is set: at the end of the block."""
+def meanwhile(work: Callable[[threading.Event], None]) -> Iterator[None]:
+    """Run `work` in a thread of its own while the block runs. It has to return once the event that it is given is set, at the end of the block."""
     ended = threading.Event()
-    clock = threading.Thread(target=show, args=(ended,), daemon=True)
-    clock.start()
+    thread = threading.Thread(target=work, args=(ended,), daemon=True)
+    thread.start()
     try:
         yield
     finally:
         ended.set()
-        clock.join()
+        thread.join()
 
 
 def _show(what: str, ended: threading.Event) -> None:

@@ -59,14 +59,14 @@ class Registry:
         return load_target(name, target) if isinstance(target, str) else target
 
     def packages(self) -> dict[str, list[str]]:
-        """The targets of installed packages by name, with the package: "package.module:Name of my-package 1.0"; of each name the first is used."""
+        """What installed packages have under each name, such as "package.module:Name of my-package 1.0"; the first of each is used."""
         found: dict[str, list[str]] = {}
         for point in entry_points(group=self.group):
             found.setdefault(point.name, []).append(f"{point.value}{_package(point)}")
         return {name: list(dict.fromkeys(places)) for name, places in found.items()}
 
     def is_taken(self, name: str) -> bool:
-        """Whether what an installed package has under a name is not taken, for it is registered here."""
+        """Whether a name is registered here, so that what an installed package has under the same name is not used."""
         return name in self._targets
 
     def _installed(self) -> Mapping[str, str]:
@@ -79,15 +79,16 @@ def _package(point: EntryPoint) -> str:
 
 @lru_cache(maxsize=64)
 def _points(find: Callable[..., Iterable[EntryPoint]], group: str, _folders: tuple[tuple[str, float], ...]) -> Mapping[str, str]:
-    """The targets of a group by name, as `find` finds them in folders that were modified at these times; of one name the first, as of modules.
+    """The targets of an entry-point group by name. Of several with one name the first on the path counts, as for modules.
 
-    Finding reads a file of every package that is installed, and a command asks twenty times for what only an installation changes.
+    Cached, because `find` reads a file of every installed package, and a command asks some twenty times. `_folders`: those of the path, and when each
+    was modified, which an installation changes.
     """
     return {point.name: point.value for point in reversed(list(find(group=group)))}
 
 
 def _modified(folder: str) -> float:
-    """When something was last added to a folder or removed, in seconds; 0 where there is none."""
+    """When something was last added to or removed from a folder, in seconds; 0 for a folder that does not exist."""
     try:
         return os.stat(folder or os.curdir).st_mtime
     except OSError:

@@ -106,7 +106,7 @@ def test_a_worker_that_dies_while_it_starts_is_replaced(monkeypatch):
     monkeypatch.setattr(farm, "LOOK_S", 0.2)
     monkeypatch.setitem(farm.LOCAL, "distributed.deploy.lost-worker-timeout", "1 s")
     instantiate = Nanny.instantiate
-    with farm._connected("local:2") as client, farm._kept_workers(client, "local:2"):
+    with farm._connected("local:2") as client, farm._kept_workers(client, "local:2", lambda: None):
 
         async def dies(nanny):
             monkeypatch.setattr(Nanny, "instantiate", instantiate)  # the next one lives

@@ -42,7 +42,7 @@ def test_tiles_and_levels_by_distance_leave_them_out_too(tmp_path):
     make_cut(folder, 2, work)
     tiles = opened(Base(folder), 0.5, None, recipe("default", 0.5, views="given"), work)
     base, request = wrap_model(folder), LadderRequest("playcanvas", coarsest=1 / 8)
-    levels = scene_of(base, request, request.first_band(base.target("playcanvas"), base.effects()))
+    levels = scene_of(base, request, request.first_band(base))
     for views in (lambda: tiles.views.adapted, lambda: levels.views):
         with pytest.warns(UserWarning, match="5 of 8 cameras see no splat"):
             assert len(showing(views(), base.model.parameters()["means"], 0.2)) == len(views()) == 3

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from mipmap_plugin.commands.common import print_facts, scene, without_none, wrap
-from mipmap_plugin.commands.many import NO_CHECKPOINT, Many, Request, adapt_many, jobs_of
+from mipmap_plugin.commands.common import print_json, scene, without_none, wrap
+from mipmap_plugin.commands.many import NO_CHECKPOINT, Many, Request, adapt_many, finished_before, jobs_of
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.pages import AdaptationPage, look_at
 from mipmap_plugin.commands.terminal_picture import show_before_and_after
@@ -41,7 +41,7 @@ class Changes:
     steps: int | None = None
     """Maximum number of optimizer steps."""
     time_budget_s: float | None = None
-    """Maximum number of seconds for each file; with --tiles for each tile instead, one after the other without --jobs."""
+    """Maximum number of seconds for each file; with --tiles for each tile, and tiles are adapted one after the other without --jobs."""
     target_db: float | None = None
     """Stop at this PSNR against the pseudo truth (not against photographs)."""
     resize: ResizeFilter | None = None
@@ -82,14 +82,14 @@ def adapt(
         viewer: Viewer to make the file for: classic, spark, ...; portable: all; several: a file each. By default what draws as the training did.
         splats: Maximum number of splats. Without a scale, the file is made for the zoom that so many splats suit.
         bytes: Maximum size of the file, such as 20MB, in place of a number of splats.
-        images: Folder of the scene. A zoom-in is then adapted to its training images, at the resolution of the base, instead of the base's own.
+        images: Folder of the scene. A zoom-in is then adapted to its training images, at the base's resolution, instead of to the base's own.
         report: Also write a page that shows what came out: NAME.report.html beside the file, or in the folder of several files.
         overwrite: Replace outputs that exist.
         json: Print the reports as JSON.
     """
     settings, base = without_none(**vars(changes)) | dict(recipe=recipe, seed=seed), Base(Path(), cameras, background, backend, screen_filter, up)
     if many.tiles is not None or many.asked(checkpoints):
-        _refuse_for_many(many.holds(checkpoints), scale, bytes, report)
+        _refuse_for_many(bool(checkpoints or many.list), scale, bytes, report)
         request = Request(_requests(scale, viewer), output, settings | without_none(most_splats=splats), images, overwrite)
         adapt_jobs = adapt_many if many.tiles is None else adapt_tiled
         return adapt_jobs(many, checkpoints, request, base, threads, json)
@@ -97,9 +97,9 @@ def adapt(
     wrapped = wrap(replace(base, checkpoint=checkpoint), threads)
     most = _most(wrapped, splats, bytes, adapted_path(checkpoint, output, 1.0, several=False), (scale, viewer), settings)
     settings, requests = settings | without_none(most_splats=most), _requests(scale or _fitting(wrapped.model, most), viewer)
-    files = [(*request, adapted_path(checkpoint, output, *request, several=len(requests) > 1)) for request in requests]
+    files = _files(checkpoint, output, requests)
     before = _finished(jobs_of(checkpoint, Request(requests, output, settings, images, overwrite), base, several=len(files) > 1), files, json)
-    left = [file for file in files if file[:2] not in before]
+    left = [file for file in files if file[2] not in before]
     _check(wrapped, left, settings, overwrite)
     page = AdaptationPage(checkpoint, [target for *_, target in files], overwrite) if report else None
     models = _adapted(wrapped, left, settings | dict(images=images and scene(replace(base, checkpoint=checkpoint), images)))
@@ -107,7 +107,7 @@ def adapt(
     if page:
         page.write(made, [*before.values()])
     if json:
-        print_facts([before.get(file[:2]) or made.pop(0) for file in files], json)
+        print_json([before.get(file[2]) or made.pop(0) for file in files])
     elif page:
         say(look_at(page.path))
 
@@ -122,27 +122,25 @@ def _refuse_for_many(given: bool, scales: Sequence[float], size: str | None, pag
         raise SettingsError("--bytes and --report are for one checkpoint at a time, without tiles; leave them out, or adapt them one by one")
 
 
-def _finished(jobs: Sequence[Job], files: Sequence[File], json: bool) -> dict[tuple[float, str | None], dict[str, Any]]:
-    """The reports of the files, by scale and viewer, that an interrupted command has written; none of a single file, which is made or refused.
+def _files(checkpoint: Path, output: Path | None, requests: Sequence[tuple[float, str | None]]) -> list[File]:
+    """What is made for each scale and viewer. Raises SettingsError for two of them with the same path."""
+    files = [(*request, adapted_path(checkpoint, output, *request, several=len(requests) > 1)) for request in requests]
+    targets = [target for *_, target in files]
+    if twice := [target for number, target in enumerate(targets) if target in targets[:number]]:
+        raise SettingsError(f"two scales would both be written to {twice[0]}; give scales that differ more, or adapt to them one by one")
+    return files
 
-    `jobs`: what would make each of them.
-    """
-    from mipmap_plugin.jobs.finished import finished
 
-    kept = len(files) > 1 and not jobs[0].overwrite
-    there = {file[:2]: finished(replace(job, target=file[2])) if kept else None for job, file in zip(jobs, files, strict=True)}
-    found = {request: done for request, done in there.items() if done}
-    for file, _ in found.values() if not json else ():
-        say(f"{file}: finished before")
-    return {request: {"file": str(file), **report} for request, (file, report) in found.items()}
+def _finished(jobs: Sequence[Job], files: Sequence[File], json: bool) -> dict[Path, dict[str, Any]]:
+    """The reports of files that an interrupted command has written; none of a single file, which is made or refused. `jobs`: what would make each."""
+    if len(files) == 1 or jobs[0].overwrite:
+        return {}
+    return finished_before([replace(job, target=target) for job, (*_, target) in zip(jobs, files, strict=True)], json)
 
 
 def _check(wrapped: Wrapped, files: Sequence[File], settings: dict[str, Any], overwrite: bool) -> None:
     """Raise now what adapting and saving would raise, as far as it can be predicted."""
-    targets = [target for *_, target in files]
     further = {name: value for name, value in settings.items() if name != "recipe"}
-    if twice := [target for number, target in enumerate(targets) if target in targets[:number]]:
-        raise SettingsError(f"two scales would both be written to {twice[0]}; give scales that differ more, or adapt to them one by one")
     for scale, viewer, target in files:
         config = make_config(settings["recipe"], scale, **further)
         wrapped.targets(viewer)

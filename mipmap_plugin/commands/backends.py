@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from mipmap_plugin.commands.common import print_facts
+from mipmap_plugin.commands.common import print_json
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 
@@ -28,10 +28,12 @@ def backends(check: str | None = None, full: bool = False, json: bool = False) -
         raise SettingsError("--full needs a backend to check; give --check NAME")
     if check is None:
         rows = tables.listing()
-        say(tables.listing_table(rows)) if not json else print_facts([asdict(row) for row in rows], json)
-        return
+        return print_json([asdict(row) for row in rows]) if json else say(tables.listing_table(rows))
     outcomes = tables.check(check, full=full)
-    say(f"{tables.check_table(outcomes)}\n{summary(outcomes)}") if not json else print_facts([asdict(row) for row in outcomes], json)
+    if json:
+        print_json([asdict(row) for row in outcomes])
+    else:
+        say(f"{tables.check_table(outcomes)}\n{summary(outcomes)}")
     failed = [row.case for row in outcomes if not row.passed]
     if failed:
         more = f" and {len(failed) - NAMED} more" if len(failed) > NAMED else ""

@@ -44,7 +44,7 @@ def wrap(base: Base, threads: int | None = None) -> Wrapped:
 
 
 def base_cameras(wrapped: Wrapped, given: Path | None) -> str:
-    """Where the cameras of an adapted file's base were found; "" if they lay beside the file, or in it, or were `given`."""
+    """Where the cameras were found, if they are those of the base of an adapted file; "" if they lay beside the file or in it, or were `given`."""
     from mipmap_plugin.models.zipped_folder import told
 
     place = wrapped.cameras_from.get("scene", "")
@@ -65,14 +65,16 @@ def without_none(**options: Any) -> dict[str, Any]:
     return {name: value for name, value in options.items() if value is not None}
 
 
-def print_facts(facts: Any, as_json: bool) -> None:
-    """Print facts by name, or as JSON, which is printed quiet or not."""
-    if as_json:
-        put(json_text(facts))
-        return
+def print_json(facts: Any) -> None:
+    """Print facts as JSON, quiet or not."""
+    put(json_text(facts))
+
+
+def print_facts(facts: dict[str, Any]) -> None:
+    """Print facts, each behind its name; of a list each entry on a line of its own."""
     for name, value in facts.items():
         lines = value if isinstance(value, list) else [value]
-        hanging = None if name == "file" else KEY + 2 * (len(lines) > 1)  # a path is copied; of several entries each is seen to begin
+        hanging = None if name == "file" else KEY + 2 * (len(lines) > 1)  # a path is not wrapped, to be copied
         for line in lines:
             say(f"{name + ':' if name else '':{KEY}}{line}", hanging)
             name = ""

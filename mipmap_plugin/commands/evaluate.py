@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from mipmap_plugin.commands.common import print_facts, scene, without_none, wrap
+from mipmap_plugin.commands.common import print_json, scene, without_none, wrap
 from mipmap_plugin.commands.pages import evaluation_gallery, evaluation_page_path, look_at, write_evaluation_page
 from mipmap_plugin.commands.resuming import resumable, resume_path
 from mipmap_plugin.commands.types import BackendName, Background, Scales, ScreenFilter, Seed, Threads, unique_scales
@@ -85,7 +85,7 @@ def evaluate(
             wrapped, photographs = wrap(base, threads), _scene(base, folder, appearance)
             results.measure(name, wrapped, photographs, appearance, recipe, settings)
     facts = results.write(checkpoint, output, overwrite)
-    print_facts(facts, json) if json else results.print_tables(_title(checkpoint, images, protocol, results.judged), published)
+    print_json(facts) if json else results.print_tables(_title(checkpoint, images, protocol, results.judged), published)
 
 
 class _Results:

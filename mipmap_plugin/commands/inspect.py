@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mipmap_plugin.commands.common import base_cameras, print_facts
+from mipmap_plugin.commands.common import base_cameras, print_facts, print_json
 from mipmap_plugin.commands.types import Cameras, Checkpoint, ScreenFilter, Up
 from mipmap_plugin.process.garbage import uncollected
 from mipmap_plugin.progress import announced
@@ -32,7 +32,7 @@ def inspect(
     Args:
         checkpoint: A PLY or a model folder.
         iteration: Which iteration of a model folder; by default the newest.
-        viewers: Render a few views as web viewers do, and report their PSNR against the renders of the training.
+        viewers: Render a few views as web viewers do, and report their PSNR against renders with the filter of the training.
         all: Also list the effects that are off, with reasons. The JSON always has them.
         json: Print JSON instead of sentences.
     """
@@ -43,24 +43,21 @@ def inspect(
         found = detect(checkpoint, iteration=iteration)
         known = {"file": told(found.path), "family": found.family}
         if not json:
-            print_facts(known, json)  # before torch is imported
-        from mipmap_plugin.models.inria_folder import read_options
-        from mipmap_plugin.scenes import load_scene
+            print_facts(known)  # before torch is imported
         from mipmap_plugin.wrap import wrap_model
 
         model = load_model(checkpoint, iteration=iteration)
-        scene = None if cameras is None else load_scene(cameras, read_options(model.folder)[0])
-        wrapped = wrap_model(model, cameras=scene, screen_filter=screen_filter, up=up)
+        wrapped = wrap_model(model, cameras=cameras, screen_filter=screen_filter, up=up)
     facts = _facts(checkpoint, wrapped, cameras, whole=all or json)
     asked = [note for note in model.notes if "--screen-filter" in note and screen_filter]  # which is answered
     if not json:
-        print_facts(facts, json)  # before pictures are drawn, which takes longer
+        print_facts(facts)  # before pictures are drawn, which takes longer
     with announced("drawing as viewers do"):
         from mipmap_plugin.evaluation.viewer_differences import viewer_differences
 
         differences = viewer_differences(wrapped) if viewers else "not requested"
     last = {"viewers": differences, "notes": [note for note in model.notes if note not in [*facts["health"], *asked]]}
-    print_facts(known | facts | last if json else last, json)
+    print_json(known | facts | last) if json else print_facts(last)
 
 
 def _facts(checkpoint: Path, wrapped: Wrapped, given: Path | None, *, whole: bool) -> dict[str, Any]:

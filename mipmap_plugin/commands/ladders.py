@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mipmap_plugin.commands.common import print_facts
-from mipmap_plugin.commands.pages import LEVELS_PAGE, look_at, write_levels_page
+from mipmap_plugin.commands.common import print_json
+from mipmap_plugin.commands.pages import PAGE, look_at, write_levels_page
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import MipmapPluginError, OutputError, SettingsError
 from mipmap_plugin.formats.splat_transform import LOD_META, refuse_exchange
@@ -124,15 +124,14 @@ def _ends_at_once(wrapped: Wrapped, request: LadderRequest) -> str:
         return ""  # and no ladder
     if request.until_splats is not None and len(wrapped.model.parameters()["means"]) <= request.until_splats:
         return "--until-splats"
-    band = request.first_band(wrapped.target(request.viewer), wrapped.effects())
+    band = request.first_band(wrapped)
     return "--coarsest" if band.reaches(request.coarsest) else ""
 
 
 def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path] = (), json: bool = False) -> None:
     """Print a ladder's manifest, as JSON or in lines."""
     if json:
-        print_facts(manifest, json)
-        return
+        return print_json(manifest)
     lines = _distances(folder, manifest) if manifest.get("by") == "distance" else _zooms(folder, manifest)
     if missed := _below(manifest):
         lines.append(f"  {', '.join(missed)}: below the {manifest['least_db']:g} dB that were asked for, in the narrowest band that is tried")
@@ -140,7 +139,7 @@ def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path
     base = min(point["base_db"] for point in manifest["curve"])
     lines.append(f"  at worst {manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} on average; the base alone falls to {base:.1f} dB")
     lines.append(f"  {manifest['measured']}")
-    say("\n".join([*lines, *(look_at(path) if path.name == LEVELS_PAGE else f"  {path}" for path in exports)]))
+    say("\n".join([*lines, *(look_at(path) if path.name == PAGE else f"  {path}" for path in exports)]))
 
 
 def _below(manifest: dict[str, Any]) -> list[str]:

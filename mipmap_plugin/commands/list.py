@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from mipmap_plugin.commands.common import print_facts
+from mipmap_plugin.commands.common import print_facts, print_json
 from mipmap_plugin.errors import MipmapPluginError
 from mipmap_plugin.process.garbage import uncollected
 
@@ -25,13 +25,12 @@ def list_(kinds: tyro.conf.Positional[tuple[Kind, ...]] = (), json: bool = False
         json: Print JSON.
     """
     if json:
-        print_facts({each: _facts(each) for each in kinds or KINDS}, json)
-        return
+        return print_json({each: _facts(each) for each in kinds or KINDS})
     for each in kinds or KINDS:
         facts = _facts(each)
         added = [f"{name}: {what}" for name, what in facts["of packages"].items()]
         refused = [f"recognized and refused: {', '.join(facts['refused'])}"] if facts.get("refused") else []
-        print_facts({each: [", ".join(facts["built in"]), *refused, *added]}, json)
+        print_facts({each: [", ".join(facts["built in"]), *refused, *added]})
 
 
 def _facts(kind: str) -> dict[str, Any]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mipmap_plugin.commands.common import print_facts
+from mipmap_plugin.commands.common import print_json
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import JobsFailed, SettingsError, install
@@ -34,23 +34,18 @@ class Many:
     dask: str | None = None
     """Adapt on the workers of dask.distributed: tcp://HOST:8786 for a scheduler, local:4 for four workers of this machine."""
     send_files: bool = False
-    """With --dask: send checkpoints and get files back, also where workers see this disk; by default only where one does not."""
+    """With --dask: send checkpoints to the workers and get files back, also if they see this disk; by default only if one does not."""
     shard: str | None = None
     """Do a part of the jobs only, such as 3/50: every fiftieth, from the third on."""
     skip_existing: bool = False
-    """Do nothing where the output was already made, from the same base with the same settings. Several checkpoints do so by default."""
-
+    """Skip outputs that were already made from the same base with the same settings. With several checkpoints this is the default."""
     tiles: int | None = None
-    """Cut one large checkpoint into so many parts for a zoom-out, each of which is adapted as a job of its own, with less memory."""
+    """Zoom-out of a large checkpoint: cut it into this many parts, each of which is adapted as a job of its own, with less memory."""
 
     def asked(self, checkpoints: Sequence[Path]) -> bool:
         """Whether these are jobs, rather than one checkpoint."""
         options = (self.jobs, self.dask, self.shard)
         return self.is_list(checkpoints) or self.skip_existing or any(each is not None for each in options)
-
-    def holds(self, checkpoints: Sequence[Path]) -> bool:
-        """Whether there is a checkpoint at all, or a list of them."""
-        return bool(checkpoints) or self.list is not None
 
     def is_list(self, checkpoints: Sequence[Path]) -> bool:
         """Whether there may be several checkpoints, so that an output is a folder for all."""
@@ -112,6 +107,19 @@ def jobs_of(checkpoint: Path, request: Request, base: Base, *, several: bool) ->
         target = adapted_path(checkpoint, request.output, scale, viewer, several=several).absolute()
         jobs.append(Job(own, target, scale, viewer, recipe, settings, images, request.overwrite))
     return jobs
+
+
+def finished_before(jobs: Iterable[Job], json: bool, *, may_load: bool = True) -> dict[Path, dict[str, Any]]:
+    """The reports of outputs that an earlier command has made, by the job's target; each output is named unless JSON is printed.
+
+    `may_load`: whether a base may be loaded to find that out (`jobs.finished`).
+    """
+    from mipmap_plugin.jobs.finished import finished
+
+    found = {job.target: before for job in jobs if (before := finished(job, may_load=may_load))}
+    for file, _ in found.values() if not json else ():
+        say(f"{file}: finished before")
+    return {target: {"file": str(file), **report} for target, (file, report) in found.items()}
 
 
 def _checkpoints(given: Sequence[Path]) -> list[Path]:
@@ -187,7 +195,7 @@ def _print(outcomes: Sequence[Outcome], jobs: Sequence[Job], json: bool) -> None
     """The outcomes in the order of their jobs, whatever the order in which they ended."""
     sorted_outcomes = in_order(outcomes, jobs)
     if json:
-        print_facts(facts(sorted_outcomes), json)
+        print_json(facts(sorted_outcomes))
         return
     say(table(sorted_outcomes))
     say(totals(outcomes, len(jobs)))

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from mipmap_plugin.pages.gallery import Gallery
     from mipmap_plugin.wrap import Wrapped
 
-# The page in the folder of a ladder.
-LEVELS_PAGE = "report.html"
+# The page in the folder of a ladder or of a tradeoff.
+PAGE = "report.html"
 
 
 def look_at(page: Path) -> str:
@@ -84,8 +84,8 @@ class AdaptationPage:
 
 def tradeoff_page_path(folder: Path, overwrite: bool) -> Path:
     """The page in the folder of a tradeoff. Raises OutputExists."""
-    refuse_output(folder / "report.html", overwrite, is_file=True)
-    return folder / "report.html"
+    refuse_output(folder / PAGE, overwrite, is_file=True)
+    return folder / PAGE
 
 
 def write_tradeoff_page(page: Path | None, checkpoint: Path, base: Wrapped, tradeoffs: Sequence[Tradeoff], overwrite: bool) -> Path | None:
@@ -110,4 +110,4 @@ def write_levels_page(folder: Path, ladder: Contents | DistanceContents, title: 
 
     name, manifest, commands = f"{title}: levels", read_manifest(folder), (this_command(),)
     page = walks_page(name, ladder, manifest, commands) if isinstance(ladder, DistanceContents) else levels_page(name, ladder, manifest, commands)
-    return write_page(folder / LEVELS_PAGE, page, overwrite=True)
+    return write_page(folder / PAGE, page, overwrite=True)

@@ -85,8 +85,7 @@ def render(
     for camera, picture in counted(zip(views, pictures, strict=True), len(views), "rendering", "view"):
         _write(picture, wrapped.render(camera.zoomed(zoom), zoom, filter_name, supersampling, **options), outputs, overwrite)
     count = f"{len(views)} picture{'s' if len(views) > 1 else ''}"
-    taken = [f"at x{zoom:g}"] * (scale is None and zoom != 1) + [f"in {own_viewer}"] * (own_viewer is not None)
-    say(", ".join([f"{count} in {output}", *[" ".join(taken), "which the file was adapted for"] * bool(taken)]))
+    say(f"{count} in {output}{_told_by_file(zoom if scale is None else 1.0, own_viewer)}")
     if place := base_cameras(wrapped, cameras):
         say(f"seen by the cameras of its base, in {place}; --cameras gives others")
 
@@ -97,6 +96,12 @@ def _tell_if_not_drawn(wrapped: Wrapped, viewer: str) -> None:
 
     if reason := why_no_viewer(wrapped.model):
         warnings.warn(f"{viewer}: {reason}; the pictures show what its settings would make of these splats", stacklevel=1)
+
+
+def _told_by_file(scale: float, viewer: str | None) -> str:
+    """What the file alone decided about its pictures, to be appended to a sentence: the scale, unless it is 1, and the viewer."""
+    taken = ([f"at x{scale:g}"] if scale != 1 else []) + ([f"in {viewer}"] if viewer else [])
+    return f", {' '.join(taken)}, which the file was adapted for" if taken else ""
 
 
 def _check(wrapped: Wrapped, views: Sequence[Camera], exposure: bool) -> None:

@@ -54,10 +54,8 @@ def shown_view(adapted: Adapted) -> Camera:
 
 def before_and_after(base: Wrapped, adapted: Adapted, view: Camera) -> Tensor:
     """[H, W, 3]: the base and the adapted model, as the viewer that the file is for draws them, each pixel enlarged."""
-    import torch
+    from mipmap_plugin.formats.images import beside_each_other
 
     viewer = next(iter(adapted.viewers), "") or None
     images = [base.render(view, viewer=viewer).image, adapted.render(view, viewer=viewer).image]
-    enlarged = max(1, SHOWN // view.height)
-    large = [image.clamp(0, 1).cpu().repeat_interleave(enlarged, 0).repeat_interleave(enlarged, 1) for image in images]
-    return torch.cat([large[0], torch.ones(len(large[0]), GAP, 3), large[1]], dim=1)
+    return beside_each_other([image.clamp(0, 1) for image in images], SHOWN, GAP)

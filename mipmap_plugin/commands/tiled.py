@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Generator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from mipmap_plugin.commands.common import print_facts
-from mipmap_plugin.commands.many import Many, Request, engine, jobs_of
+from mipmap_plugin.commands.common import print_json
+from mipmap_plugin.commands.many import Many, Request, engine, finished_before, jobs_of
 from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.jobs.base import Base
@@ -31,7 +31,7 @@ def adapt_tiled(many: Many, given: Sequence[Path], request: Request, base: Base,
 
     jobs = jobs_of(given[0], request, base, several=len(request.targets) > 1)
     skip = many.skip_existing or (len(jobs) > 1 and not request.overwrite)  # as in a list
-    reports = _finished(jobs, json) if skip else {}
+    reports = finished_before(jobs, json, may_load=False) if skip else {}  # the base may not fit into memory
     left = [job for job in jobs if job.target not in reports]
     try:
         for job, joined in zip(left, adapt_all_in_tiles(left, many.tiles, run, threads), strict=True):
@@ -42,17 +42,7 @@ def adapt_tiled(many: Many, given: Sequence[Path], request: Request, base: Base,
         again = " with --skip-existing" if len(jobs) > 1 and not skip else ""
         raise KeyboardInterrupt(f"interrupted; run the same command again{again} to go on where it stopped") from interrupt
     if json:
-        print_facts([reports[job.target] for job in jobs], json)
-
-
-def _finished(jobs: Sequence[Job], json: bool) -> dict[Path, dict[str, Any]]:
-    """The reports of what is finished already, by the target, from the hash of the base's file alone: the base may not fit into memory."""
-    from mipmap_plugin.jobs.finished import finished
-
-    found = {job.target: before for job in jobs if (before := finished(job, may_load=False))}
-    for file, _ in found.values() if not json else ():
-        say(f"{file}: finished before")
-    return {target: {"file": str(file), **facts} for target, (file, facts) in found.items()}
+        print_json([reports[job.target] for job in jobs])
 
 
 def _say(job: Job, tiles: int, joined: Joined) -> None:

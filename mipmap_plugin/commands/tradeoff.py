@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from mipmap_plugin.commands.common import print_facts, scene, without_none, wrap
+from mipmap_plugin.commands.common import print_json, scene, without_none, wrap
 from mipmap_plugin.commands.pages import look_at, tradeoff_page_path, write_tradeoff_page
 from mipmap_plugin.commands.resuming import resumable
 from mipmap_plugin.commands.types import Background, Cameras, Checkpoint, Scales, ScreenFilter, Up, unique_scales
@@ -97,8 +97,7 @@ def _print(tradeoffs: Sequence[Tradeoff], page: Path | None, json: bool) -> None
     from mipmap_plugin.evaluation.tradeoff.files import facts, table
 
     if json:
-        print_facts(facts(tradeoffs, complete=True), json)
-        return
+        return print_json(facts(tradeoffs, complete=True))
     say("\n\n".join(table(tradeoff) for tradeoff in tradeoffs))
     if page:
         say(look_at(page))

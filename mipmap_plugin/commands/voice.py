@@ -17,8 +17,11 @@ from typing import Any, TextIO, cast
 from mipmap_plugin.commands.log import Log
 from mipmap_plugin.errors import OutputError, SettingsError
 
-# What a command is announced by that is to be run next; what stands for its spaces while lines are broken; the columns that a text needs at least.
-NEXT, UNBROKEN, LEAST_WIDTH = "next: ", "\0", 20
+# The word before a command that the user may run next, and what stands for the command's spaces while the lines around it are wrapped.
+NEXT, UNBROKEN = "next: ", "\0"
+
+# The fewest columns that are left for a text after its indentation.
+LEAST_WIDTH = 20
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ VOICE: ContextVar[Voice] = ContextVar("VOICE", default=Voice())  # noqa: B039  a
 
 
 def say(text: str, hanging: int | None = None) -> None:
-    """Print `text` unless the command is quiet; also write it to the log. `hanging`: in a terminal, wrap it and indent further lines so."""
+    """Print `text` unless the command is quiet; also write it to the log. `hanging`: on a terminal, wrap it, with further lines indented so far."""
     voice = VOICE.get()
     voice.write(text)
     if not voice.quiet:
@@ -46,7 +49,7 @@ def say(text: str, hanging: int | None = None) -> None:
 
 
 def wrapped(text: str, hanging: int, width: int) -> str:
-    """A text in lines of `width` columns, of which all but the first are indented. What follows NEXT stays on one line, to be copied."""
+    """Wrap a text to `width` columns, all lines but the first indented by `hanging`. What follows NEXT stays on one line, to be copied."""
     words, found, command = text.partition(NEXT)
     kept = words + found + command.replace(" ", UNBROKEN)
     lines = textwrap.wrap(
@@ -56,21 +59,21 @@ def wrapped(text: str, hanging: int, width: int) -> str:
 
 
 def put(text: str) -> None:
-    """Print `text` at once, for whoever reads it from a pipe, as the address of a live view.
+    """Print `text` without buffering, so that a program that reads it through a pipe gets it at once.
 
-    Raises OutputError where it cannot be printed, and BrokenPipeError where nobody reads it any more; then what is printed later is lost.
+    Raises OutputError if it cannot be printed, and BrokenPipeError if nobody reads it any more. After either, everything printed later is discarded.
     """
     try:
         print(text, flush=True)
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains again at its end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # otherwise Python reports the error again when it exits
         if isinstance(error, BrokenPipeError):
             raise
         raise OutputError(f"the standard output cannot be written ({error.strerror}); print to another place") from error
 
 
 def detail(text: str) -> None:
-    """Write what few people read to the log alone."""
+    """Write what few people need to the log only."""
     VOICE.get().write(text)
 
 
@@ -82,7 +85,7 @@ def complain(text: str) -> None:
 
 
 def take_any_text() -> None:
-    """Print also what the terminal's encoding lacks, such as names of files that are no text; and nothing where a stream is closed."""
+    """Let any text be printed: characters that the terminal's encoding lacks are escaped, and what is printed to a closed stream is discarded."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8", errors="replace"))  # noqa: SIM115  for as long as the process lives
@@ -91,7 +94,7 @@ def take_any_text() -> None:
 
 
 def options(words: Sequence[str]) -> tuple[list[str], bool, Path | None]:
-    """The words of a command without --quiet and --log FILE, which go with every command, and both. Raises SettingsError."""
+    """Take --quiet and --log FILE out of a command's words: the other words, whether to be quiet, and the file. Raises SettingsError."""
     rest, quiet, log = list[str](), False, None
     remaining = iter(words)
     for word in remaining:
@@ -109,7 +112,7 @@ def options(words: Sequence[str]) -> tuple[list[str], bool, Path | None]:
 
 @contextlib.contextmanager
 def speaking(quiet: bool, log: Path | None) -> Iterator[None]:
-    """Speak like this inside the block. A log is appended to, line by line. Raises OutputError."""
+    """Inside the block, be `quiet` or not, and append everything that is said to the file `log`. Raises OutputError."""
     with contextlib.ExitStack() as stack:
         file = None if log is None else stack.enter_context(contextlib.closing(Log(log)))
         if quiet:

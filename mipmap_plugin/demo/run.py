@@ -9,7 +9,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.target.resize import resize
@@ -20,12 +19,11 @@ from mipmap_plugin.evaluation.evaluate import Evaluator, Row, adapted_row, train
 from mipmap_plugin.evaluation.protocols import Protocol
 from mipmap_plugin.evaluation.report import table
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
-from mipmap_plugin.formats.images import write_image
+from mipmap_plugin.formats.images import beside_each_other, write_image
 from mipmap_plugin.pages.gallery import Gallery
 from mipmap_plugin.pages.html import write_page
 from mipmap_plugin.pages.reports import evaluation_page
 from mipmap_plugin.process import threads
-from mipmap_plugin.process.threads import side_by_side
 from mipmap_plugin.progress import announced
 from mipmap_plugin.scenes import read_cameras
 from mipmap_plugin.wrap import Wrapped, wrap_model
@@ -99,7 +97,7 @@ def run_demo(
         view = judge.views[0]
         camera = view.camera.zoomed(scale)
         pictures = [base.render(camera, viewer=viewer).image, adapted.render(camera).image, view.truth(scale, PROTOCOL)]
-        write_image(output / f"x{scale:g}_base_adapted_truth.png", beside_each_other(pictures), overwrite=overwrite)
+        write_image(output / f"x{scale:g}_base_adapted_truth.png", shown(pictures), overwrite=overwrite)
     page = _page(output, gallery, rows, viewer, overwrite) if gallery else None
     detail(table(rows))
     return story(rows, viewer, time.perf_counter() - began, output, page)
@@ -122,7 +120,7 @@ def judged_views(base: Wrapped, scale: float) -> list[WorldView]:
         cameras = [camera.window(round(camera.width * MIDDLE), round(camera.height * MIDDLE)) for camera in cameras]
     views = [WorldView(camera) for camera in cameras]
     with announced(f"ray-tracing the truth x{scale:g}"), threads.limited(None, shared=True):
-        list(side_by_side(lambda view: view.truth(scale, PROTOCOL), views, threads.for_views()))
+        list(threads.side_by_side(lambda view: view.truth(scale, PROTOCOL), views, threads.for_views()))
     return views
 
 
@@ -134,13 +132,9 @@ def settings_for(base: Wrapped) -> dict[str, Any]:
     return dict(cameras=train, views="given", views_per_step=1, time_budget_s=REFERENCE_BUDGET_S)
 
 
-def beside_each_other(pictures: Sequence[Tensor]) -> Tensor:
-    """Pictures [h, w, 3] of one size beside each other, each about SHOWN px high: small ones enlarged by whole pixels."""
-    pictures = [picture.cpu() for picture in pictures]  # a truth is ray-traced there
+def shown(pictures: Sequence[Tensor]) -> Tensor:
+    """Pictures [h, w, 3] of one size beside each other, each about SHOWN px high."""
     height, width = pictures[0].shape[:2]
-    times = max(1, SHOWN // height)
-    shown = [picture.repeat_interleave(times, 0).repeat_interleave(times, 1) for picture in pictures]
     if height > SHOWN:
-        shown = [resize(picture, (SHOWN, round(width * SHOWN / height)), "pil-bicubic") for picture in pictures]
-    gap = torch.ones(shown[0].shape[0], SHOWN // 40, 3)
-    return torch.cat([shown[0], *(part for picture in shown[1:] for part in (gap, picture))], dim=1)
+        pictures = [resize(picture.cpu(), (SHOWN, round(width * SHOWN / height)), "pil-bicubic") for picture in pictures]
+    return beside_each_other(pictures, SHOWN, SHOWN // 40)

@@ -14,7 +14,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import Camera, viewmat_of
 from mipmap_plugin.demo.geometry import Capsules, Hit, Slab, nothing
 from mipmap_plugin.errors import SettingsError
 
@@ -70,8 +70,8 @@ def _wheel() -> Capsules:
     """An upright bicycle wheel with crossed spokes."""
     center = torch.tensor([0.0, 0.08, 0.62])
 
-    def upright(points: Tensor, radius: float, depth: float = 0.0) -> Tensor:
-        return center + radius * points[:, [0, 2, 1]] + torch.tensor([0.0, depth, 0.0])
+    def upright(points: Tensor, radius: float) -> Tensor:
+        return center + radius * points[:, [0, 2, 1]]
 
     ring, spokes = _arc(0, 360, 73), _arc(0, 345, 24)
     lean = torch.tensor([-0.05, 0.05]).repeat(12)[:, None] * torch.tensor([0.0, 1.0, 0.0])
@@ -214,11 +214,8 @@ def _looking_at_target(azimuth: float, elevation: float) -> Tensor:
     flat = math.cos(elevation)
     backward = torch.tensor([flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)], dtype=torch.float64)
     right = torch.tensor([-math.sin(azimuth), math.cos(azimuth), 0.0], dtype=torch.float64)
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.stack([right, torch.linalg.cross(right, backward), -backward])
-    eye = torch.tensor(TARGET, dtype=torch.float64) + ORBIT_RADIUS * backward
-    pose[:3, 3] = -pose[:3, :3] @ eye
-    return pose
+    rotation = torch.stack([right, torch.linalg.cross(right, backward), -backward], dim=1)
+    return viewmat_of(rotation, torch.tensor(TARGET, dtype=torch.float64) + ORBIT_RADIUS * backward)
 
 
 @torch.no_grad()

@@ -19,7 +19,7 @@ from typing import Any
 from mipmap_plugin.errors import MipmapPluginError, OutputError, OutputExists, of_system
 from mipmap_plugin.formats.staging import Staging, missing_folders, remove_empty, settle
 
-# Files that systems leave in folders, and that nobody misses.
+# Files that operating systems leave in folders, and that may be deleted with them.
 OF_SYSTEMS = {".DS_Store", "Thumbs.db", "desktop.ini"}
 
 # The output that is being written, if any.
@@ -148,8 +148,10 @@ def refuse_output(path: Path, overwrite: bool, base: Iterable[Path] = (), *, is_
 
 
 def refuse_unwritable(path: Path, room: int = 0, *, what: str = "the base takes", why: str = "") -> None:
-    """Raise OutputError if `path` could not be written: no permission, a read-only disk, fewer than `room` bytes free. `what` takes so many, and what
-    else there is to say of them, are parts of the sentence."""
+    """Raise OutputError if `path` could not be written: no permission, a read-only disk, fewer than `room` bytes free.
+
+    `what` needs the bytes and `why`, a remark on them, are parts of the message.
+    """
     with _as_output_error(path):
         place = absolute(path)
         there = next(folder for folder in place.parents if os.path.lexists(folder))

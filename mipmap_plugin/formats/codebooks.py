@@ -13,17 +13,17 @@ CODES = 256
 # Bins of the histogram that codes are placed by, and rounds of k-means that then move them.
 BINS, ROUNDS = 4096, 3
 
-# Share of the codes that lie evenly over the whole range, so that none is far from any number, whatever its weight.
+# Fraction of the codes that lie evenly over the whole range, so that every number has one near it, whatever its weight.
 EVEN = 0.5
 
-# The usual range of values goes from the first of these shares of them to the second. Codes are placed by differences within so many times that range
-# of the median, and by ratios beyond: one value that is very far away would leave all others in a single bin.
+# Values between these quantiles count as usual. Codes are spaced evenly up to so many times that range away from the median, and in proportion to the
+# distance beyond: otherwise one value that is very far away would leave all others in a single bin.
 USUAL, NEAR = (0.01, 0.99), 30
 
 # The seed of what is drawn: the same splats give the same bytes.
 SEED = 0
 
-# Powers of the weights: by which first entries of a palette are drawn, and by which a part of the splats gets its share of it.
+# Powers of the weights by which the first entries of a palette are drawn, and by which the parts of the splats share its entries.
 DRAWN, SHARED = 0.5, 1 / 3
 
 # Rows that are compared with all entries at a time.
@@ -31,7 +31,7 @@ ROWS = 4096
 
 
 def codebook(values: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """256 numbers [256], ascending, and which of them each of the `values` is rounded to, in its shape, as uint8. `weights`: of that shape."""
+    """256 ascending numbers, and the index of the one that each of the `values` is rounded to, uint8 in their shape. `weights`: of that shape."""
     flat, shares = values.astype(np.float64).ravel(), weights.astype(np.float64).ravel()
     distinct = np.unique(flat)
     codes = distinct if len(distinct) <= CODES else _moved(_placed(flat, shares), flat, shares)
@@ -40,7 +40,7 @@ def codebook(values: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _placed(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Codes whose density is the cube root of that of the weights, which makes the error least, mixed with an even one."""
+    """Codes whose density is the cube root of that of the weights, which minimizes the square error, mixed with an even density."""
     middle, near = np.median(values), NEAR * np.ptp(np.quantile(values, USUAL)) or np.ptp(values)
     values = np.arcsinh((values - middle) / near)
     low, high = values.min(), values.max()

@@ -181,6 +181,14 @@ def paletted(image: Tensor) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(quantized), np.asarray(quantized.getpalette()).reshape(-1, 3)
 
 
+def beside_each_other(images: Sequence[Tensor], height: int, gap: int) -> Tensor:
+    """Images [h, w, 3] of one size beside each other, `gap` white px apart; small ones are enlarged by whole pixels, up to `height` px."""
+    times = max(1, height // images[0].shape[0])
+    large = [image.cpu().repeat_interleave(times, 0).repeat_interleave(times, 1) for image in images]
+    white = torch.ones(large[0].shape[0], gap, 3)
+    return torch.cat([large[0], *(part for image in large[1:] for part in (white, image))], dim=1)
+
+
 def data_uri(image: Tensor, side: int) -> str:
     """The middle of an image [h, w, 3], at most `side` x `side` px, as the address of a PNG."""
     height, width = image.shape[:2]

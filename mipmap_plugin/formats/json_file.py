@@ -1,4 +1,4 @@
-"""Validated reading of JSON files of cameras: every error is a SceneError that says what is wrong, where, and what to do."""
+"""Validated reading of JSON files, mostly of cameras: every error is a SceneError that says what is wrong, where, and what to do."""
 
 from __future__ import annotations
 

@@ -157,7 +157,9 @@ def _parsed(path: Path, lines: list[bytes], body: int) -> Header:
         try:
             keyword, rest = [*line.decode("utf-8", "replace").strip().split(maxsplit=1), "", ""][:2]
             if keyword == "format":
-                form = _known(rest.split()[0], BYTE_ORDER)
+                form = rest.split()[0]
+                if form not in BYTE_ORDER:
+                    raise ValueError(form)
             elif keyword == "element":
                 elements.append(Element(rest.split()[0], _count(rest.split()[1]), ()))
             elif keyword == "property":
@@ -186,12 +188,6 @@ def _with_property(element: Element, words: list[str]) -> Element:
     if name in element.names:
         raise _Fault("the second property of this name")
     return replace(element, properties=(*element.properties, (name, " ".join(kind))))
-
-
-def _known(word: str, table: Mapping[str, str]) -> str:
-    if word not in table:
-        raise ValueError(word)
-    return word
 
 
 def _count(word: str) -> int:

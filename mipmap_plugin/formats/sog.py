@@ -22,16 +22,16 @@ from mipmap_plugin.formats.tags import DAMAGE, meta_of_sog
 # Entries of the table of spherical harmonics: their numbers have 16 bits, and 64 of them lie in a row.
 MOST_ENTRIES, IN_A_ROW = 1 << 16, 64
 
-# Steps of a coordinate, and of a rotation's and an opacity's number.
+# The largest stored integers: of a coordinate, and of a number of a rotation or an opacity.
 PLACES, LEVELS = 65535, 255
 
-# Who may read a file that is unpacked, as of Unix: all, or a web server could not.
+# Unix permissions of unpacked files: all may read them, or a web server could not.
 READABLE = 0o644
 
 # Which three numbers of a quaternion (w, x, y, z) are stored where that of each index is the largest, and the byte that says so.
 OTHERS, LARGEST_IS_W = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]), 252
 
-# Log scales this far below a splat's longest axis, and below the longest of all, are the same to the eye, and would spread the codes.
+# Log scales this far below a splat's longest axis, or below the longest of all, cannot be told apart by the eye, and would only spread the codes.
 FLATTEST, SMALLEST = 12.0, 25.0
 
 
@@ -40,7 +40,7 @@ def write_sog(path: Path, columns: Mapping[str, np.ndarray], *, antialiased: boo
     count = len(columns["x"])
     opacities = (1 + np.tanh(columns["opacity"].astype(np.float64) / 2)) / 2
     scales = _visible(_stack(columns, "scale_{}", 3).astype(np.float64))
-    weights = opacities * np.exp(np.sort(scales - scales.max(), axis=1)[:, 1:].sum(1))  # what a splat covers: where an error shows
+    weights = opacities * np.exp(np.sort(scales - scales.max(), axis=1)[:, 1:].sum(1))  # what a splat covers, where an error shows
     weights = np.maximum(weights / weights.max(), np.finfo(np.float32).tiny) if weights.max() > 0 else np.ones(count)
     places, low, high = _places(np.stack([columns[axis] for axis in "xyz"], 1).astype(np.float64))
     order = _morton(places)  # neighbors beside each other are smaller files

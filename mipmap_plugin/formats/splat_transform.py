@@ -30,15 +30,15 @@ EXCHANGE = {
     "compressed": ("compressed PLY", ".compressed.ply"),
 }
 
-# Suffixes of the formats that are written: by it, but for GLB (`formats.glb`) and SOG (`formats.sog`), which it reads back.
+# Suffixes of the formats that are written. splat-transform writes them, except GLB (`formats.glb`) and SOG (`formats.sog`), which it only reads back.
 WRITTEN = (".spz", ".sog", ".compressed.ply", ".glb")
 READ_ONLY = tuple(ending for _, ending in EXCHANGE.values() if ending not in WRITTEN)
 
-# Suffix -> the oldest version of splat-transform that is needed: of a lod-meta.json, one that has the options of `streamed_sog`; of a SOG, which
-# `formats.sog` writes, the oldest that was seen to read it back.
+# The oldest version of splat-transform that is needed to write a file, by its suffix: of a lod-meta.json, one that has the options of `streamed_sog`;
+# of a SOG, the oldest that was seen to read back what `formats.sog` writes.
 OLDEST: dict[str, tuple[int, ...]] = {".sog": (2, 7), ".json": (3, 0), ".spz": (2, 1)}
 
-# A ladder of SOGs, which viewers stream, and the oldest version of splat-transform that reads it, also as older ones wrote it: its finest level.
+# The file of a ladder of SOGs, which viewers stream, and the oldest version of splat-transform that reads its finest level.
 LOD_META, OLDEST_FOR_STREAMED = "lod-meta.json", (3, 2)
 
 # The last version of SPZ that Spark 2.2 reads, and the first that splat-transform can write; its own choice is 4.
@@ -51,7 +51,7 @@ MOST_BANDS = 3
 # in the frame in which they are stored.
 TURNS_SPZ = ((2, 1), (3, 0))
 
-# Suffixes of other files: who asks for one does not expect a folder of that name.
+# Suffixes of other kinds of files. A model is not written to a folder with such a name: whoever gives it expects a file.
 OF_FILES = (".pt", ".pth", ".ckpt", ".npz", ".npy", ".glb", ".gltf", ".obj", ".usd", ".usdz", ".html", ".json", ".csv", ".txt", ".zip", ".png")
 
 TOOL = "splat-transform"
@@ -214,7 +214,7 @@ def find_tool() -> list[str] | None:
 
 def _run(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str:
     """Run splat-transform. Returns its error message, empty on success."""
-    options = ["--gpu", "cpu", *(["--spz-version", SPZ_VERSION] if _is_spz(target) else [])]
+    options = ["--gpu", "cpu", *(["--spz-version", SPZ_VERSION] if is_spz(target) else [])]
     command = [*tool, "--quiet", "--overwrite", *options, *map(str, inputs), str(target)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=LONGEST, check=False)
@@ -229,7 +229,7 @@ def _run(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str
 
 def _settle_frame(tool: Sequence[str], file: Path, ply: Path) -> None:
     """Turn the splats of a PLY that were, or will be, turned on their way from or to `file`."""
-    if _is_spz(file) and TURNS_SPZ[0] <= _version(tool) < TURNS_SPZ[1]:
+    if is_spz(file) and TURNS_SPZ[0] <= _version(tool) < TURNS_SPZ[1]:
         from mipmap_plugin.formats.half_turn import half_turned  # and NumPy, without which options are read
 
         half_turned(ply)
@@ -259,7 +259,8 @@ def is_glb(path: Path) -> bool:
     return path.name.lower().endswith(".glb")
 
 
-def _is_spz(path: Path) -> bool:
+def is_spz(path: Path) -> bool:
+    """Whether a path is that of an SPZ."""
     return path.name.lower().endswith(".spz")
 
 

@@ -1,4 +1,4 @@
-"""Spherical harmonics of an SPZ in all the 8 bits that the format has for a number, where its usual writer keeps 5 of them, or 4, to save bytes."""
+"""Writes the spherical harmonics of an SPZ again with all 8 bits that the format has for a number; its usual writer keeps 5 or 4, to save bytes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 # The header: magic, version, splats, SH degree, bits of fractions, flags, and a byte that is reserved.
 HEADER = struct.Struct("<4sIIBBBB")
 
-# A number of 1.0 above the one that means 0.
+# A coefficient c is stored as ZERO + ONE · c.
 ONE, ZERO = 128, 128
 
 

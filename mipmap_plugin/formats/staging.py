@@ -47,8 +47,8 @@ class Staging:
         """The staging path of `path` (absolute): here, if it is the output, beside it, or in a folder that is being written."""
         if path.is_relative_to(self.new):
             return path
-        made = self.new / os.path.relpath(path, self.place)
-        return made if path.parent == self.place or (self.new / self.path.name in made.parents and (self.new / self.path.name).is_dir()) else None
+        made, folder = self.new / os.path.relpath(path, self.place), self.new / self.path.name
+        return made if path.parent == self.place or (folder in made.parents and folder.is_dir()) else None
 
     def commit(self) -> None:
         """Move what was written to `new` to its place. Raises OSError."""

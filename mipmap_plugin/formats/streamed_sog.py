@@ -52,10 +52,10 @@ def write_streamed_sog(levels: Sequence[Path], output: Path, extent: int) -> Non
     """
     tool = refuse_exchange(output)
     card = _graphics_card(tool)
-    small = [] if card else ["--lod-chunk-count", str(SMALL_FILE)]
+    machine = ["--gpu", card] if card else ["--gpu", "cpu", "--sh-iterations", "1", "--lod-chunk-count", str(SMALL_FILE)]
     chunks = ["--lod-chunk-extent", str(extent), "--lod-chunk-min", str(SMALLEST_CHUNK)]
     inputs = [word for number, file in enumerate(levels) for word in (str(file), "--tag-lod", str(number))]
-    command = [*tool, "--no-tty", "--overwrite", *_table_options(card), *small, *chunks, *inputs, str(output)]
+    command = [*tool, "--no-tty", "--overwrite", *machine, *chunks, *inputs, str(output)]
     if reason := _followed(command) or ("" if output.is_file() else "it wrote nothing"):
         raise OutputError(f"{output}: {TOOL} does not write it ({reason})")
 
@@ -67,11 +67,6 @@ def _graphics_card(tool: Sequence[str]) -> str:
     except (OSError, subprocess.TimeoutExpired):
         return ""
     return next((number for number, name in re.findall(r"^\[(\d+)\] (.*)$", listed, re.MULTILINE) if not SOFTWARE.search(name)), "")
-
-
-def _table_options(card: str) -> list[str]:
-    """How SOG's table of spherical harmonics is found: on the GPU of that number; without one, in a single iteration, for each takes minutes."""
-    return ["--gpu", card] if card else ["--gpu", "cpu", "--sh-iterations", "1"]
 
 
 def read_chunks(file: Path) -> list[Chunk]:

@@ -1,4 +1,4 @@
-"""Header comments that name the screen filter and the provenance of a splat file, and what exchange formats have in their place."""
+"""Header comments that name the screen filter and the provenance of a splat file, and their equivalents in exchange formats."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def mode_in_exchange(path: Path, kind: str) -> str | None:
         model = meta_of_sog(path).get("model") if kind == "sog" else None
         return model if model in ("antialiased", "2dgs") else None
     except DAMAGE:
-        return None  # damaged, of which whoever reads its splats tells
+        return None  # damaged, which is reported when its splats are read
 
 
 def mark_antialiased(file: Path) -> None:

@@ -87,9 +87,8 @@ def _kitty(image: Tensor) -> str:
     """A PNG (f=100) that is transmitted and displayed (a=T) without an answer (q=2), in chunks, of which all but the last have m=1."""
     text = base64.b64encode(png(image)).decode("ascii")
     chunks = [text[start : start + CHUNK] for start in range(0, len(text), CHUNK)]
-    keys = ["a=T,f=100,q=2,", *[""] * (len(chunks) - 1)]
     last = len(chunks) - 1
-    return "".join(f"\x1b_G{key}m={int(number < last)};{chunk}\x1b\\" for number, (key, chunk) in enumerate(zip(keys, chunks, strict=True)))
+    return "".join(f"\x1b_G{'' if number else 'a=T,f=100,q=2,'}m={int(number < last)};{chunk}\x1b\\" for number, chunk in enumerate(chunks))
 
 
 def _sixel(image: Tensor) -> str:

@@ -1,4 +1,4 @@
-"""A PLY in a zip archive, as phones and web pages hand it out, and what is unpacked of any archive: no more than its disk has room for."""
+"""Unpacks zip archives, no more than the disk has room for, and finds the PLY in an archive of one, as phones and web pages offer it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mipmap_plugin.formats.magic import archive
 # columns are zeros, ten times; an archive that fills a disk has thousands.
 MOST_TIMES = 100
 
-# Errors of a write for which a disk, or what one user may have of it, has no room.
+# Errors of a write if the disk, or the user's quota, is full.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 

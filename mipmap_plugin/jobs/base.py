@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +10,6 @@ from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.process.garbage import uncollected
 
 if TYPE_CHECKING:
-    from mipmap_plugin.camera import Camera
     from mipmap_plugin.scenes import Scene
     from mipmap_plugin.wrap import Wrapped
 
@@ -33,17 +31,11 @@ class Base:
         """What is given beside the checkpoint, as its adaptations record it, without loading it. Raises CheckpointError, SceneError."""
         from mipmap_plugin.adaptation.cameras_of_base import own_cameras
         from mipmap_plugin.models import detect
-        from mipmap_plugin.models.inria_folder import read_options
-        from mipmap_plugin.scenes import load_scene
         from mipmap_plugin.wrap import asked_for
 
         folder = self._model_folder()
-        if self.cameras is not None:
-            cameras: Sequence[Camera] = load_scene(self.cameras, read_options(folder)[0]).cameras
-        else:
-            own, _ = own_cameras(detect(self.checkpoint).path, folder)
-            cameras = own if isinstance(own, list) else own.cameras
-        return asked_for(folder, cameras, COLORS[self.background], self.screen_filter, self.up)
+        found = self._given_scene(folder) or own_cameras(detect(self.checkpoint).path, folder)[0]
+        return asked_for(folder, found if isinstance(found, list) else found.cameras, COLORS[self.background], self.screen_filter, self.up)
 
     def photographs(self, path: Path) -> Scene:
         """The scene at `path`, to whose photographs the checkpoint is compared or adapted. Raises CheckpointError, SceneError."""
@@ -74,14 +66,19 @@ class Base:
         found = detect(self.checkpoint)
         return None if found.family == "exchange" else found.folder
 
-    def _loaded(self, folder: Path | None, threads: int | None) -> Wrapped:
-        from mipmap_plugin.backends import BACKENDS
+    def _given_scene(self, folder: Path | None) -> Scene | None:
+        """The scene with the cameras that are given, read with the options of the model `folder`."""
         from mipmap_plugin.models.inria_folder import read_options
         from mipmap_plugin.scenes import load_scene
+
+        return None if self.cameras is None else load_scene(self.cameras, read_options(folder)[0])
+
+    def _loaded(self, folder: Path | None, threads: int | None) -> Wrapped:
+        from mipmap_plugin.backends import BACKENDS
         from mipmap_plugin.wrap import WrapOptions, wrap_model
 
         if self.backend != "auto":
             BACKENDS.get(self.backend)
-        scene = None if self.cameras is None else load_scene(self.cameras, read_options(folder)[0])
+        scene = self._given_scene(folder)  # before the splats, which take longer to read
         told: WrapOptions = {"background": COLORS[self.background], "screen_filter": self.screen_filter, "up": self.up}
         return wrap_model(self.checkpoint, cameras=scene, backend=self.backend, threads=threads, **told)

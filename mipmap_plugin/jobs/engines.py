@@ -76,15 +76,15 @@ def with_interrupted(futures: Futures, as_completed: Callable[[Futures], Futures
 
 
 def longest_first(jobs: Sequence[Job]) -> list[Job]:
-    """The jobs in the order in which several workers do them: behind a long one that comes last, all but one have nothing to do.
+    """The jobs for several workers, the longest first: if one of them came last, all other workers would wait for it.
 
-    What a job takes is guessed by the bytes of its checkpoint and its scale, which it grows with.
+    How long a job takes is estimated from the bytes of its checkpoint and from its scale.
     """
     return sorted(jobs, key=lambda job: -size_of(job.base.checkpoint) * job.scale)
 
 
 def size_of(checkpoint: Path) -> int:
-    """The bytes of the file with a checkpoint's splats; 0 where there is none, which its job then says."""
+    """The bytes of the file with a checkpoint's splats; 0 if there is none, which its job will report."""
     try:
         return detect(checkpoint).path.stat().st_size
     except (MipmapPluginError, OSError):

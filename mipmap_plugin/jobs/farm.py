@@ -29,15 +29,15 @@ from mipmap_plugin.jobs.finished import finished
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.parcel import Delivery, Parcel, do_parcel, pack, unpack
 from mipmap_plugin.jobs.worker import Worker, do
-from mipmap_plugin.progress import note
+from mipmap_plugin.progress import meanwhile, note
 
 PACKAGE = "mipmap-plugin"
 
 # Seconds between two looks at whether jobs are to stop; to reach a scheduler; between two looks at whether there are workers.
 PERIOD_S, CONNECT_S, LOOK_S = 1.0, 20.0, 10.0
 
-# Of workers on this machine, whose cores have to do the work: dask takes no samples of what its workers wait for, looks at its clock twice and not
-# fifty times a second, and gives no worker a second job before the first has ended.
+# Settings of dask for workers on this machine, whose cores are needed for the work: no samples for its profiler, a tick of its clock twice and not
+# fifty times a second, and no second job for a worker before its first has ended.
 LOCAL: dict[str, Any] = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "500 ms",
@@ -47,11 +47,11 @@ LOCAL: dict[str, Any] = {
 # Jobs whose files are sent at a time.
 SENT_PER_WORKER = 2
 
-# How often a job is handed out that dask gives up, as it does when four workers died while they did it. It goes on from its state, and what
-# takes too much memory ends our worker, not dask's: so these are workers that others ended, as clouds and batch systems do.
+# How often a job is handed out at most. dask gives a job up after four of its workers died while they did it. A job that takes too much memory ends
+# our worker and not dask's, so dask's were ended from outside, by a cloud or a batch system; the next one continues the job from its state.
 HANDED_OUT = 5
 
-# Why there is no outcome of a task that nobody does any more.
+# Why a task has no outcome and nobody does it any more.
 LOST = "the connection to the scheduler was lost"
 
 _mine = threading.local()
@@ -100,7 +100,7 @@ def on_dask(jobs: Sequence[Job], place: str, threads: int | None = None, *, send
 
 
 def _refuse_other_versions(client: Client, place: str) -> None:
-    """Raise SettingsError for workers that lack this package, whom a job would end, or that have another version, which adapts otherwise."""
+    """Raise SettingsError for workers that lack this package, which a job would crash, or that have another version, whose results differ."""
     try:
         ours = version(PACKAGE)
     except PackageNotFoundError:  # of a source tree, of which no version is known
@@ -124,7 +124,7 @@ def _outcomes(todo: Sequence[tuple[Job, Any]], submit: Callable[[Any], Future[An
 
 
 def _sent(jobs: Sequence[Job], client: Client) -> tuple[list[Outcome], list[tuple[Job, Any]]]:
-    """The outcomes of the jobs that need not or cannot be done, which a worker cannot know that does not see this disk; the others, sent."""
+    """Decide here what workers that do not see this disk cannot know: the outcomes of jobs that need not or cannot be done, and all others, sent."""
     outcomes, sent = [], []
     for job in jobs:
         try:
@@ -138,7 +138,7 @@ def _sent(jobs: Sequence[Job], client: Client) -> tuple[list[Outcome], list[tupl
 
 
 def _task(sent: Job | Parcel, threads: int | None, stop_name: str) -> Outcome | Delivery:
-    """What a dask worker does: it lets a worker of ours do the job, and tells that when to stop."""
+    """What a dask worker does: it lets a worker process of ours do the job, and stops that once the event is set."""
     stop = Event(stop_name)
     worker: Worker | None = getattr(_mine, "worker", None)
     if worker is None or worker.stopped or worker.threads != threads:
@@ -152,15 +152,14 @@ def _task(sent: Job | Parcel, threads: int | None, stop_name: str) -> Outcome | 
 @contextmanager
 def _stopped_by(stop: Event, worker: Worker) -> Iterator[None]:
     """Inside, the worker is stopped once `stop` is set."""
-    ended = threading.Event()
 
-    def watch() -> None:
+    def watch(ended: threading.Event) -> None:
         while not ended.wait(PERIOD_S):
             with suppress(OSError, asyncio.TimeoutError):  # a scheduler that cannot be reached now
                 if stop.is_set():
                     return worker.stop()
 
-    with _beside(watch, ended):
+    with meanwhile(watch):
         yield
 
 
@@ -198,14 +197,12 @@ def _connected(place: str) -> Iterator[Client]:
 
 @contextmanager
 def _kept_workers(client: Client, place: str, forsaken: Callable[[], object]) -> Iterator[None]:
-    """Inside, a line says when there are no workers, at two looks in a row; `forsaken` is called at each. Workers of this machine that died are
-    replaced.
+    """Inside, look regularly whether there are workers: at each look that finds none call `forsaken`, and at the second in a row write a line.
 
-    dask does so itself, but for a worker that dies while it starts.
+    Also replace workers of this machine that died, as dask does itself except for one that dies while it starts.
     """
-    ended = threading.Event()
 
-    def watch() -> None:
+    def watch(ended: threading.Event) -> None:
         looks = 0
         while not ended.wait(LOOK_S):
             if client.cluster is not None:
@@ -217,20 +214,8 @@ def _kept_workers(client: Client, place: str, forsaken: Callable[[], object]) ->
                 if looks == 2:
                     note(f"--dask {place}: there are no workers, so nothing is done until one comes; Ctrl-C ends this, and the same command goes on")
 
-    with _beside(watch, ended):
+    with meanwhile(watch):
         yield
-
-
-@contextmanager
-def _beside(watch: Callable[[], None], ended: threading.Event) -> Iterator[None]:
-    """Inside, `watch` runs in a thread of its own, until `ended` is set."""
-    watcher = threading.Thread(target=watch, daemon=True)
-    watcher.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        watcher.join()
 
 
 @contextmanager

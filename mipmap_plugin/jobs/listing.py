@@ -47,7 +47,7 @@ def _matches(pattern: Path) -> list[Path]:
 
 
 def without_outputs(checkpoints: Iterable[Path]) -> tuple[list[Path], list[Path]]:
-    """The checkpoints that no adaptation has made, and the others, which a pattern such as output/* finds too once there are outputs."""
+    """Separate checkpoints from outputs of adaptations, which a pattern such as output/* also finds: both lists."""
     kept: list[Path] = []
     left_out: list[Path] = []
     for path in checkpoints:
@@ -58,9 +58,9 @@ def without_outputs(checkpoints: Iterable[Path]) -> tuple[list[Path], list[Path]
 def _is_output(path: Path) -> bool:
     from mipmap_plugin.models import detect
     from mipmap_plugin.models.outputs import is_adapted
-    from mipmap_plugin.models.places import LADDER
+    from mipmap_plugin.models.places import MANIFEST
 
-    if is_adapted(path) or (path / LADDER).is_file():
+    if is_adapted(path) or (path / MANIFEST).is_file():
         return True
     try:
         return path.is_dir() and is_adapted(detect(path).path)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import TEMPORARY, SettingsError
 from mipmap_plugin.formats.atomic import named, new_file, new_folder, refuse_output, together
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.models import detect
@@ -64,7 +64,7 @@ def pack(job: Job) -> Parcel:
 
 def do_parcel(parcel: Parcel, do: Callable[[Job], Outcome]) -> Delivery:
     """Do the job of a parcel in a folder of its own, which is removed at the end."""
-    with tempfile.TemporaryDirectory(prefix="mipmap_plugin-") as folder:
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as folder:
         place, job = Path(folder), parcel.job
         with tarfile.open(fileobj=io.BytesIO(parcel.files)) as archive:
             archive.extractall(place, filter="data")
@@ -127,7 +127,7 @@ def _scene(path: Path, folder: Path) -> dict[Path, Path]:
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """All files below a folder, also in links to folders, as photographs often are, but not in those to where they lie in."""
+    """All files below a folder. Links to folders are followed, as photographs often are behind one, but not links to a folder around them."""
     for entry in sorted(folder.iterdir()):
         if entry.is_file():
             yield entry

@@ -21,7 +21,7 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"
 # A job whose worker dies is begun again this many times in all, and continues where its state was last saved.
 ATTEMPTS = 2
 
-# The exit code of a process that the system killed: less than nothing by the number of SIGKILL, a name that Windows lacks.
+# The exit code of a process that the system killed: minus the number of SIGKILL, a name that Windows lacks.
 KILLED = -9
 
 
@@ -112,7 +112,7 @@ def _start(threads: int | None) -> subprocess.Popen[bytes]:
 
 @contextmanager
 def _ctrl_c_waits() -> Iterator[None]:
-    """What this thread starts inside hears Ctrl-C once it says so (`serve`), and not while it imports, where Python would tell of that."""
+    """A process started inside gets Ctrl-C only once it asks for it (`serve`): while it imports, Python would print a traceback."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
@@ -125,5 +125,5 @@ def _ctrl_c_waits() -> Iterator[None]:
 
 def _close(process: subprocess.Popen[bytes]) -> None:
     for pipe in filter(None, (process.stdin, process.stdout)):
-        with suppress(OSError):  # a job that was on its way
+        with suppress(OSError):  # with a job that was half written
             pipe.close()

@@ -37,7 +37,7 @@ class Switch:
 
     zoom: float
     psnr_db: float  # of the finer level there, against the base; about that of the coarser
-    likeness_db: float  # PSNR between the images of both levels
+    likeness_db: float  # PSNR between the images of both levels there
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
-from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.frozen_base import FrozenBase
@@ -43,19 +43,19 @@ def make_levels(base: FrozenBase, request: LadderRequest, resume: str | Path | N
 
     Raises SettingsError for a model that no viewer draws, for views that show nothing and for a group of viewers, BackendUnavailable, Interrupted.
     """
+    folder = None if resume is None else path_of(resume, "resume")
     if reason := why_no_viewer(base.model):
         raise SettingsError(f"{base.model.family}: {reason}; levels are files for viewers, so adapt it to one scale at a time")
     base.refuse_undrawn()
     if by_distance(base, request):
-        return make_levels_by_distance(base, request, resume)
+        return make_levels_by_distance(base, request, folder)
     with threads.limited(base.threads, shared=False):
-        return _make_levels(base, request, resume)
+        return _make_levels_by_zoom(base, request, folder)
 
 
-def _make_levels(base: FrozenBase, request: LadderRequest, resume: str | Path | None) -> Ladder:
-    """`make_levels` by zoom."""
-    band = request.first_band(base.target(request.viewer), base.effects())
-    store = LevelStore(None if resume is None else path_of(resume, "resume"), base, request)
+def _make_levels_by_zoom(base: FrozenBase, request: LadderRequest, resume: Path | None) -> Ladder:
+    band = request.first_band(base)
+    store = LevelStore(resume, base, request)
     with announced("rendering the base"):
         yardstick = Yardstick(base, request.seed)
     work = _Work(base, request, store, yardstick)
@@ -77,14 +77,10 @@ class _Work:
     store: LevelStore
     yardstick: Yardstick
 
-    def first(self, band: Band) -> Level:
-        """x1: the base, converted to the viewer unless that draws it as its training did."""
-        as_it_is = self.base.target(self.request.viewer) == self.base.effects()
-        return self._made("level_0", band, {} if as_it_is else band.settings())
-
     def levels(self, band: Band) -> tuple[list[Level], list[LeftOut], float]:
         """The levels, those that are left out because they are no use as coarser ones, and the zoom down to which there was one made."""
-        levels, left_out, ratio = [self.first(band)], list[LeftOut](), band.ratio
+        first = self._made("level_0", band, self.request.for_first(self.base, band))
+        levels, left_out, ratio = [first], list[LeftOut](), band.ratio
         while not self._ends(levels[-1], band):
             level, ratio = self._next(levels[-1], band, len(levels) + len(left_out), ratio)
             band, reason = level.band, _no_use(level, levels[-1])
@@ -99,7 +95,7 @@ class _Work:
         start, ratio = FinerLevel(finer.adapted.model, finer.band.scale), self.request.next_ratio(above.low, ratio)
         while True:
             band = above.next(ratio, self.request.coarsest)
-            level = self._made(f"level_{number}_x{band.scale:.6g}", band, self.request.below(start, band))
+            level = self._made(f"level_{number}_x{band.scale:.6g}", band, self.request.arguments(self.request.below(start, band)))
             narrower = ratio**0.5
             if self._suffices(level) or narrower * SAME < FINEST_RATIO:
                 return level, ratio
@@ -110,14 +106,8 @@ class _Work:
         few = self.request.until_splats is not None and coarsest.splats <= self.request.until_splats
         return few or last.reaches(self.request.coarsest)
 
-    def _made(self, name: str, band: Band, settings: dict[str, object]) -> Level:
-        request = self.request
-        options = {"recipe": request.recipe, "viewer": request.viewer, **settings, **request.settings}
-
-        def make(state: Path | None) -> Adapted:
-            return self.base.adapt(band.scale, resume=state, **options)
-
-        return Level(self.store.level(name, make), band)
+    def _made(self, name: str, band: Band, arguments: dict[str, Any]) -> Level:
+        return Level(self.store.level(name, lambda state: self.base.adapt(band.scale, resume=state, **arguments)), band)
 
     def _suffices(self, level: Level) -> bool:
         """Whether a level is as good as requested at the ends of its band."""

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.pixel_size import pixel_size, seen_pixel_size
+from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.formats.atomic import new_folder, refuse_output, refuse_to_lose, refuse_unwritable, sha256, write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.contents import Contents
 from mipmap_plugin.levels.yardstick import TRUTH
-from mipmap_plugin.models.places import LADDER, REPORT
+from mipmap_plugin.models.places import MANIFEST as MANIFEST
+from mipmap_plugin.models.places import REPORT
 
-MANIFEST = LADDER
 FORMAT = "mipmap_plugin levels 1"
+
+# px: the shorter side of the canvas that distances are computed for, unless another is given; they are in proportion to it.
+CANVAS = 1080
 
 # What is written into the folder of a ladder, also by what converts one.
 WRITTEN = (MANIFEST, "level_*.ply", f"level_*.ply{REPORT}", "report.html", "streamed/*", "tiles/*")
@@ -39,11 +45,19 @@ def refuse_ladder(folder: Path, base: FrozenBase, *, overwrite: bool, room: int 
 
 
 def write_ladder(ladder: Contents, folder: Path, overwrite: bool) -> Path:
-    """Write the levels, a report beside each, and the manifest; the folder appears complete or not at all. Raises OutputExists, OutputError."""
+    """`write_levels` of a ladder by zoom."""
     refuse_ladder(folder, ladder.base, overwrite=overwrite)
+    return write_levels([level.adapted for level in ladder.levels], lambda files: manifest(ladder, files), folder, overwrite)
+
+
+def write_levels(levels: Sequence[Adapted], manifest_of: Callable[[list[Path]], dict[str, Any]], folder: Path, overwrite: bool) -> Path:
+    """Write the levels, a report beside each, and the manifest; the folder appears complete or not at all. Raises OutputExists, OutputError.
+
+    `manifest_of`: makes the manifest of the levels' files.
+    """
     with new_folder(folder, overwrite) as temporary:
-        files = [level.adapted.save(temporary / level_name(number)) for number, level in enumerate(ladder.levels)]
-        write_json(temporary / MANIFEST, manifest(ladder, files), overwrite=False)
+        files = [level.save(temporary / level_name(number)) for number, level in enumerate(levels)]
+        write_json(temporary / MANIFEST, manifest_of(files), overwrite=False)
     return folder
 
 
@@ -91,9 +105,11 @@ def _entry(ladder: Contents, number: int, file: Path) -> dict[str, Any]:
         "adapted_from": level.adapted.report.settings.band[0] * level.band.scale,
         "adapted_to": level.adapted.report.settings.band[1] * level.band.scale,
         "splats": level.splats,
-        "bytes": file.stat().st_size,
-        "sha256": sha256(file),
-        "seconds": level.adapted.report.seconds.get("total", 0.0),
-        "holds": level.adapted.report.returned,
+        **file_facts(file, level.adapted.report),
         "psnr_db": {f"{point.zoom:.4g}": point.psnr_db for point in ladder.curve if point.level == number},
     }
+
+
+def file_facts(file: Path, report: Report) -> dict[str, Any]:
+    """What the manifest says of a level's file and of how it was made."""
+    return {"bytes": file.stat().st_size, "sha256": sha256(file), "seconds": report.seconds.get("total", 0.0), "holds": report.returned}

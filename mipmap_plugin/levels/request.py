@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.effects import Effects
@@ -13,6 +13,9 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import check_scale
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.screen_filters import COMPENSATED
+
+if TYPE_CHECKING:
+    from mipmap_plugin.frozen_base import FrozenBase
 
 # The ratio of neighboring scales: WIDE or NARROW down to DENSE_BELOW, then NARROW, because small levels cost little. A level that was adapted to its
 # band loses 3 to 4 dB at the ends of an octave where the viewer compensates or hardly dilates, and 8 dB where it dilates by 0.3 px² (lego at x1/4);
@@ -92,9 +95,18 @@ class LadderRequest:
             return self.ratio
         return WIDE if target.screen_filter in COMPENSATED or target.eps2d <= SMALL_DILATION else NARROW
 
-    def first_band(self, target: Effects, trained: Effects) -> Band:
-        """The band of x1, for a viewer that draws as `target` a base that was trained to be drawn as `trained`."""
-        return Band.first(self.first_ratio(target), as_it_is=target == trained)
+    def first_band(self, base: FrozenBase) -> Band:
+        """The band of x1."""
+        target = base.target(self.viewer)
+        return Band.first(self.first_ratio(target), as_it_is=target == base.effects())
+
+    def for_first(self, base: FrozenBase, band: Band) -> dict[str, Any]:
+        """The arguments of `adapt` for x1: the base as it is if the viewer draws it as its training did, else converted to the viewer."""
+        return self.arguments({} if base.target(self.viewer) == base.effects() else band.settings())
+
+    def arguments(self, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """The arguments of `adapt` for a level with these settings; those of the request override them."""
+        return {"recipe": self.recipe, "viewer": self.viewer, **settings, **self.settings}
 
     def next_ratio(self, shown_down_to: float, ratio: float) -> float:
         """The ratio below a level that is shown down to this zoom, after levels of the given ratio."""

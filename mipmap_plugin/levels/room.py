@@ -30,7 +30,7 @@ def shares(base: FrozenBase, request: LadderRequest) -> list[float]:
     """How many splats each level is planned to have, in those of the base. Merging may keep more, where it would cost too much."""
     if base.model.traits.no_viewer:
         return [1.0]  # no ladder is made
-    band = request.first_band(base.target(request.viewer), base.effects())
+    band = request.first_band(base)
     if by_distance(base, request):
         return _by_distance(base, request, band)
     found, ratio = [1.0], band.ratio

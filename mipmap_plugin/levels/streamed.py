@@ -26,16 +26,13 @@ from mipmap_plugin.formats.splat_transform import LOD_META
 from mipmap_plugin.formats.streamed_sog import Chunk, read_chunks, write_streamed_sog
 from mipmap_plugin.levels.distance.chunks import shrunk
 from mipmap_plugin.levels.exported import readable
-from mipmap_plugin.levels.manifest import read_manifest
+from mipmap_plugin.levels.manifest import CANVAS, read_manifest
 
 STREAMED, SETTINGS = "streamed", "playcanvas.json"
 
 SINGLE_LEVEL = "this ladder has a single level, which needs no streaming"
 
-# px: the shorter side of the canvas that distances are computed for.
-CANVAS = 1080
-
-# The part of the distance of the first switch that a chunk may extend over, so that its near and far end are seen at nearly one zoom.
+# The largest extent of a chunk, as a part of the distance of the first switch: its near and its far end are then seen at nearly one zoom.
 EXTENT = 1 / 4
 
 # The splats that PlayCanvas shows at most.
@@ -96,7 +93,7 @@ def viewer_settings(manifest: dict[str, Any], chunks: Sequence[Chunk], canvas: i
     }
 
 
-def write_streamed(folder: Path, canvas: int = CANVAS, *, overwrite: bool = False) -> Path:
+def write_streamed(folder: Path, canvas: int = CANVAS) -> Path:
     """Write Streamed SOG and the viewer's settings to the subfolder `streamed` of a ladder; return its lod-meta.json.
 
     Raises SettingsError without splat-transform and for a single level, OutputExists, OutputError.
@@ -107,7 +104,7 @@ def write_streamed(folder: Path, canvas: int = CANVAS, *, overwrite: bool = Fals
         raise SettingsError(f"{folder}: {SINGLE_LEVEL}; open its level as it is")
     if rising[0] < NEAREST:
         warnings.warn(TOO_SMALL.format(least=NEAREST, first=rising[0]), stacklevel=2)
-    with new_folder(folder / STREAMED, overwrite) as temporary, TemporaryDirectory(prefix=TEMPORARY) as copies:
+    with new_folder(folder / STREAMED, overwrite=False) as temporary, TemporaryDirectory(prefix=TEMPORARY) as copies:
         made = temporary / LOD_META
         extent = manifest.get("chunk_extent", max(1, round(EXTENT * rising[0])))
         files = [level["file"] for level in manifest["levels"]]

@@ -117,14 +117,14 @@ def glb(spz: bytes, low: list[float], high: list[float]) -> bytes:
     return before_binary(document, len(binary)) + binary
 
 
-def write_tiles(folder: Path, *, overwrite: bool = False) -> Path:
+def write_tiles(folder: Path) -> Path:
     """Write 3D Tiles to the subfolder `tiles` of a ladder; return its tileset.json.
 
     Raises SettingsError without splat-transform, OutputExists, OutputError.
     """
     manifest = read_manifest(folder)
     box = bounding_box(load_model(folder / level["file"]) for level in manifest["levels"])
-    with new_folder(folder / TILES, overwrite) as temporary:
+    with new_folder(folder / TILES, overwrite=False) as temporary:
         for number, level in enumerate(manifest["levels"]):
             write_tile(folder / level["file"], temporary / f"level_{number}.glb")
         write_json(temporary / TILESET, tileset(manifest, box), overwrite=False)

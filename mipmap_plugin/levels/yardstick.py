@@ -18,7 +18,8 @@ from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.limits import derived_seed
 from mipmap_plugin.scenes.trajectories import jittered, with_company
 
-# Random views, of so many times as many the first that show something; of large images only the middle is used, as for validation.
+# The number of random views, and how many times as many are drawn at random to find so many that show something. Of large images only the middle is
+# used, as for validation.
 VIEWS, TRIED = 4, 4
 
 # Number of the random draw, apart from those of views that are adapted to and of validation.

@@ -20,8 +20,8 @@ REPORT = ".adaptation.json"
 # What is appended to it for the state of an unfinished run, and to that for the state of the conversion before the run.
 STATE, CONVERTED = ".resume", ".x1"
 
-# What lies in the folder of a ladder of levels.
-LADDER = "levels.json"
+# What lies in the folder of a ladder of levels and says what its files are (`levels.manifest`).
+MANIFEST = "levels.json"
 
 # Which files of a model folder are the networks of a moving scene.
 NETWORKS = {"4dgs": "point_cloud/*iteration_*/deformation.pth", "deformable": "deform/iteration_*/deform.pth"}

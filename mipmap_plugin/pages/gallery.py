@@ -63,12 +63,12 @@ class Gallery:
         return effects_of_base(self._base)
 
     def own(self, rows: Sequence[Row]) -> list[Row]:
-        """Those of the rows that are of this scene."""
+        """The rows of this scene."""
         scenes = {shot.scene for shots in self._shots.values() for shot in shots}
         return [row for row in rows if row.scene in scenes]
 
     def zooms(self, rows: Sequence[Row], *, named: bool = False) -> list[Zoom]:
-        """The pictures of each scale, with the means that `rows` have, from the farthest out to the nearest; `named` after their scene."""
+        """The pictures of each scale, with the means that `rows` have, by rising scale; `named`: with the scene in their labels."""
         own = self.own(rows)
         return [self._zoom(scale, self._shots[scale], own, named) for scale in sorted(self._shots)]
 
@@ -117,8 +117,8 @@ def is_default(row: str) -> bool:
 
 
 def in_order(pictures: Sequence[Picture]) -> list[Picture]:
-    """Base, adapted, supersampled and truth first, then the rest; of several in one role, such as one for each viewer, those of a row first,
-    and of several recipes the default one.
+    """Sort pictures by role: base, adapted, supersampled, truth, then the rest. Within a role those that have means of a row come first, and among
+    these the default recipe.
     """
     order: tuple[Role, ...] = ("base", "adapted", "supersampled", "truth", "other")
     return sorted(pictures, key=lambda picture: (order.index(picture.role), not picture.mean, not is_default(picture.name)))

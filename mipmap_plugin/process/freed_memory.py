@@ -1,4 +1,4 @@
-"""What a process keeps of the memory that it frees. It imports nothing, so that commands can call it first."""
+"""What a process keeps of the memory that it frees. It imports no other library, so that commands can call it first."""
 
 from __future__ import annotations
 

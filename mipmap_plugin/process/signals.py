@@ -1,5 +1,5 @@
-"""A process that is told to end, as by `timeout`, by a cluster or by the terminal that is closed, does what Ctrl-C does: it keeps what can be
-gone on from, and removes what is temporary. For commands, not for libraries: signals belong to the whole process."""
+"""Lets a process that is told to end, by `timeout`, a cluster or a closed terminal, do what it does at Ctrl-C: save the state of its work, and remove
+temporary files. For commands, not for libraries: signals belong to the whole process."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SAME_S = 5.0
 # Seconds in which a further Ctrl-C counts as the same: an impatient hand presses twice, before it can see what the first one did.
 TWICE_S = 1.0
 
-# Seconds after which Ctrl-C is heard that came where Python drops exceptions.
+# Seconds after which Ctrl-C is raised again, if it came where Python drops exceptions.
 AGAIN_S = 0.02
 
 # The exit code of a process that was interrupted by Ctrl-C. Of one that another signal ended it is 128 more than the signal's number.
@@ -36,7 +36,7 @@ class Presses:
         self._at = -TWICE_S
 
     def is_new(self) -> bool:
-        """Whether this press is another one than the last that was new."""
+        """Whether this press counts: within TWICE_S of the last one that counted, it is taken for the same."""
         now = time.monotonic()
         if now - self._at < TWICE_S:
             return False
@@ -78,7 +78,7 @@ class Ending:
 
 
 def _is_dropped_in(frame: FrameType | None) -> bool:
-    """Whether Python only tells of an exception that is raised here: in what is called when an object is deleted, as of each picture drawn."""
+    """Whether Python would drop an exception here and only print it: in a finalizer, such as runs for the memory of each picture."""
     while frame is not None:
         if frame.f_code.co_filename == weakref.__file__ or frame.f_code.co_name == "__del__":
             return True
@@ -95,7 +95,7 @@ def _press_again() -> None:
 
 
 def presses() -> Presses:
-    """Those of the command that runs: what one part of it has heard is no new one for the others. Outside of a command, new ones."""
+    """The presses of the running command, which all of its parts share, so that each press counts once; outside of a command, a new record."""
     ending = getattr(signal.getsignal(signal.SIGINT), "__self__", None)
     return ending.presses if isinstance(ending, Ending) else Presses()
 

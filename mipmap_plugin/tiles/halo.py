@@ -27,15 +27,15 @@ from mipmap_plugin.tiles.truth import part_of
 # Blend weights of a pixel that are too small to be seen.
 INVISIBLE = 1 / 255
 
-# A tile is left out of a view of which it has less than this fraction, and has so many pixels around what it has.
+# A tile is left out of views of which it fills less than this fraction. Pixels around what it fills that belong to its box.
 LEAST, PAD = 1e-3, 8
 
-# Steps from 0 to 1 of what is stored in 8 bits: it decides how strongly a splat is moved, and not what a view looks like.
+# Steps from 0 to 1 of halos, which are stored in 8 bits: they decide how strongly a splat is moved, and not what a view looks like.
 FINE = 255
 
 
 def draw_halos(scene: TiledScene, part: int, sweep: Sweep) -> None:
-    """Draw the `part`-th of a sweep's views as it begins, and write the picture, NAME, and what each tile TILE has in it around it, NAME/TILE."""
+    """Draw the `part`-th of a sweep's views as it begins; write each picture as the view's NAME, and the halo of each TILE in it as NAME/TILE."""
     splats, painter = open_state(scene, Steered.before(scene.folder, sweep.number)), scene.painter(on_black(scene.target))
     layers = [Album([layer_file(scene.folder, number, sweep.halos)]) for number in range(len(scene.cores))]
     background = torch.tensor(scene.target.background)

@@ -7,11 +7,20 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from mipmap_plugin.formats.atomic import together, write_json
+from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.jobs.job import Job, Outcome
+from mipmap_plugin.models.places import state_path
 from mipmap_plugin.process import pool
 from mipmap_plugin.process import threads as thread_pool
 from mipmap_plugin.tiles.folder import work_folder
+from mipmap_plugin.tiles.halo import draw_halos
+from mipmap_plugin.tiles.layers import draw_layers
+from mipmap_plugin.tiles.scene import TiledScene, opened
+from mipmap_plugin.tiles.start import StartSearch
+from mipmap_plugin.tiles.steering import steer, sweep_of
+from mipmap_plugin.tiles.tile import Tile
+from mipmap_plugin.tiles.truth import draw_truths
 
 Work = Literal["truth", "start", "layer", "halo", "tile", "steering"]
 
@@ -36,48 +45,30 @@ class TileJob(Job):
         """Do the work, unless its file is there already. Raises what `TiledScene` raises."""
         if self.target.exists():
             return Outcome(self, "finished before", self.target, _facts(self.target))
-        from mipmap_plugin.tiles.scene import opened
-
         scene = opened(self.base, self.scale, self.viewer, self.config(), self.target.parent)
         with thread_pool.limited_for(scene.backend, threads):
             self._do(scene)
         pool.release_to_system()
         return Outcome(self, "done", self.target, _facts(self.target))
 
-    def _do(self, scene: Any) -> None:
+    def _do(self, scene: TiledScene) -> None:
         if self.work == "truth":
-            from mipmap_plugin.tiles.truth import draw_truths
-
-            draw_truths(scene, self.number, [scene.at(job.scale, job.config(), work_folder(job.target)) for job in self.others])
-        elif self.work == "start":
-            from mipmap_plugin.tiles.start import StartSearch
-
-            StartSearch(scene).run()
-        elif self.work == "layer":
-            from mipmap_plugin.tiles.layers import draw_layers
-
-            draw_layers(scene, self.number, self._sweep(scene))
+            return draw_truths(scene, self.number, [scene.at(job.scale, job.config(), work_folder(job.target)) for job in self.others])
+        if self.work == "start":
+            return StartSearch(scene).run()
+        sweep = sweep_of(scene, self.sweep)
+        assert sweep is not None  # since this job is a part of it
+        if self.work == "layer":
+            draw_layers(scene, self.number, sweep)
         elif self.work == "halo":
-            from mipmap_plugin.tiles.halo import draw_halos
-
-            draw_halos(scene, self.number, self._sweep(scene))
+            draw_halos(scene, self.number, sweep)
         elif self.work == "steering":
-            from mipmap_plugin.tiles.steering import steer
-
-            steer(scene, self._sweep(scene))
+            steer(scene, sweep)
         else:
-            self._adapt(scene)
+            self._adapt(Tile(scene, self.number, sweep))
 
-    def _sweep(self, scene: Any) -> Any:
-        from mipmap_plugin.tiles.steering import sweep_of
-
-        return sweep_of(scene, self.sweep)
-
-    def _adapt(self, scene: Any) -> None:
-        from mipmap_plugin.models.places import state_path
-        from mipmap_plugin.tiles.tile import Tile
-
-        saved, facts, keeper = Tile(scene, self.number, self._sweep(scene)).adapt(state_path(self.target))
+    def _adapt(self, tile: Tile) -> None:
+        saved, facts, keeper = tile.adapt(state_path(self.target))
         with together(self.target):
             save_torch(self.target, saved, overwrite=True)
             write_json(facts_file(self.target), facts, overwrite=True)
@@ -91,6 +82,4 @@ def facts_file(target: Path) -> Path:
 
 
 def _facts(target: Path) -> dict[str, Any]:
-    from mipmap_plugin.formats.json_file import read_json
-
     return dict(read_json(facts_file(target))) if facts_file(target).exists() else {}

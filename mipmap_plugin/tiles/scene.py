@@ -31,7 +31,6 @@ from mipmap_plugin.models.exposure import read_exposures
 from mipmap_plugin.models.inria_folder import read_options, trained_scale
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
-from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.tiles.cut import Tree
 from mipmap_plugin.tiles.folder import BASE, CUT
 from mipmap_plugin.tiles.reading import find_splats
@@ -82,9 +81,7 @@ class TiledScene:
         if self.kind is SurfelModel:
             trained = flat_trained(trained)
         model = self.kind(self.base.parameters(sample), trained, origin)
-        scene = None if base.cameras is None else load_scene(base.cameras, options)
-        color = COLORS[base.background]
-        return wrap_model(model, cameras=scene, backend="auto", background=color, screen_filter=base.screen_filter, up=base.up)
+        return wrap_model(model, cameras=base.cameras, background=COLORS[base.background], screen_filter=base.screen_filter, up=base.up)
 
     def _backend(self, name: str) -> tuple[Any, str]:
         splats = self.wrapped.model.gaussians(self.wrapped.any_camera())

@@ -17,7 +17,7 @@ from mipmap_plugin.tiles.store import SHAPE, Store, as_parameters
 # Rows that are read at a time.
 CHUNK = 1 << 16
 
-# Standard deviations, and pixels, by which a splat may reach into a picture from outside. It ends at 3.3 deviations, and oblique ones are longer.
+# A splat may reach into a picture from outside by so many standard deviations and pixels: it ends at 3.3 deviations, and oblique ones are longer.
 REACH, MARGIN = 5.0, 4.0
 
 

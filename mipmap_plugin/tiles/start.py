@@ -1,4 +1,4 @@
-"""The splats that the tiles begin with, and that all other tiles see of each: as without tiles, but merged core by core and measured on the disk."""
+"""The splats that the tiles begin with. They are found as without tiles, but merged core by core, and drawn from the disk to be compared."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class StartSearch:
         self._take("formed", start_name(self.forms), formed_db)
 
     def _takes_merged(self, weights: Tensor, formed_db: float, base_db: float) -> bool:
-        """Take what is merged furthest at little cost, and return whether there is any; where the mildest costs too much, no other is tried."""
+        """Take the strongest merging that costs little, and return whether there is one; where the mildest costs too much, no other is tried."""
         scene, config = self.scene, self.scene.config
 
         def tried(name: str, root: int, costs: float) -> tuple[float, bool]:
@@ -154,7 +154,7 @@ class StartSearch:
         self._take("formed", AS_IT_IS, psnr)
 
     def _take(self, name: str, title: str, psnr: float) -> None:
-        """Leave the splats of a candidate as the start, and of the others nothing."""
+        """Keep the splats of a candidate as the start, and delete the other candidates."""
         for number in range(len(self.scene.cores)):
             self._file(name, number).replace(start_file(self.scene.folder, number))
             for other in CANDIDATES:

@@ -1,9 +1,9 @@
 """The whole scene at the checks of a sweep: what did harm is undone in all tiles, which go on with lower rates.
 
-A tile by itself cannot tell: what it shows of a view is a part of its error. In the warm-up a state does harm if it is worse than the start, as
-without tiles; later if it is worse than the best of its sweep, or than what that began with: in front of halos that stay as they are, rates
-that are too high drive all tiles further and further off (the first steps after the warm-up of flowers with a million splats ended below the
-start so, and done again at half of the rates 1 to 2 dB above the best before).
+A tile by itself cannot tell, because it shows only a part of a view's error. In the warm-up a state does harm if it is worse than the start, as
+without tiles. Later it does if it is worse than the best state of its sweep, or than the one that the sweep began with: as halos stay as they
+are during a sweep, rates that are too high drive all tiles further and further off. (The first steps after the warm-up of flowers with a million
+splats ended below the start in this way; repeated at half of the rates, they ended 1 to 2 dB above the best state before.)
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mipmap_plugin.tiles.store import Store
 from mipmap_plugin.tiles.sweeps import Sweep
 from mipmap_plugin.tiles.truth import Truths
 
-# What did harm is tried again this often, with half of the rates each time, before the run goes on without those steps.
+# Steps that did harm are repeated this often, at half of the rates each time, before the run goes on without them.
 MOST_REPEATS = 3
 
 

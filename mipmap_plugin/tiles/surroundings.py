@@ -129,7 +129,7 @@ class Surroundings:
 
 @dataclass(frozen=True)
 class _InHalo(SteppingRenderer):
-    """Draws a core with its surroundings by what moves it afterwards."""
+    """Draws a core with its surroundings by the backend's stepper, which moves the core's splats afterwards."""
 
     around: Surroundings
     together: ClassVar[bool] = False
@@ -150,5 +150,5 @@ class _InHalo(SteppingRenderer):
 
 
 def nothing(view: Camera) -> Camera:
-    """In place of a view that does not show the core: all tiles draw the same views in a step, each what it has in them."""
+    """What stands for a view that does not show the core. In a step all tiles take the same views, and each draws what it has in them."""
     return replace(view, width=1, height=1, name=NOTHING)

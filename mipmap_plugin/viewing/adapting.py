@@ -21,19 +21,19 @@ from mipmap_plugin.viewing.around import views_for_screen
 from mipmap_plugin.viewing.sources import File, Request, Supersampled
 from mipmap_plugin.wrap import Wrapped
 
-# Seconds between two points of the curve, and that somebody waits for the picture of a run that may just be doing something else.
+# Seconds between two points of the curve; seconds to wait for a picture of a run, which may be busy with something else.
 MEASURED_EVERY_S, PATIENCE_S = 0.7, 1.5
 
 # px: the screen's picture is measured on at most this many, around its middle.
 MEASURED_PIXELS = 200_000
 
-# Fewer than usual, because somebody is waiting.
+# Fewer than usual, because the user is waiting.
 VALIDATION_VIEWS = 10
 
 # A zoom that differs from x1 by less is x1.
 SAME_ZOOM = 0.03
 
-# Seconds that a run may take to end when the program does: with its next step, and in the middle of whatever it does.
+# Seconds to wait at the end of the program for a run to end after its next step, and then for it to end where it is.
 GRACE_S, LAST_GRACE_S = 2.0, 20.0
 
 
@@ -140,7 +140,7 @@ class Adapter:
         return self._base.adapt(wish.scale, cameras=views, observe=self._observer(wish), time_budget_s=wish.seconds, **options)
 
     def _observer(self, wish: Wish) -> Callable[[int, float, Callable[[Camera], Tensor]], bool]:
-        """Looks at the run after each step: answers who waits for a picture, and now and then measures that of the screen."""
+        """A function that the run calls after each step: it draws a picture that is waited for, and now and then measures that of the screen."""
         side = math.sqrt(min(1.0, MEASURED_PIXELS / (wish.screen.width * wish.screen.height)))
         judged = wish.screen.window(max(1, int(side * wish.screen.width)), max(1, int(side * wish.screen.height)))
         request = Request(judged, wish.zoom, wish.viewer)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mipmap_plugin.camera import Camera, evenly
+from mipmap_plugin.camera import Camera, evenly, viewmat_of
 from mipmap_plugin.scenes.orbits import GOLDEN
 from mipmap_plugin.scenes.trajectories import rotation_matrix
 from mipmap_plugin.viewing.screen import inside
@@ -41,10 +41,7 @@ def turned(screen: Camera, look_at: Tensor, number: int) -> Camera:
     axis = rotation @ torch.tensor([radius * math.cos(angle), radius * math.sin(angle), 0.0], dtype=torch.float64)
     turn = rotation_matrix(axis)
     center = look_at + turn @ (screen.center - look_at)
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = (turn @ rotation).T
-    viewmat[:3, 3] = -viewmat[:3, :3] @ center
-    return screen.looking_from(viewmat, screen.name)
+    return screen.looking_from(viewmat_of(turn @ rotation, center), screen.name)
 
 
 def middle(view: Camera, scale: float) -> Camera:

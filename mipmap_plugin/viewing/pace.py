@@ -10,7 +10,7 @@ MOVING_S, STILL_S = 0.12, 0.25
 # The smallest fraction of the width and height that is drawn.
 COARSEST = 1 / 8
 
-# How much of an estimate the newest picture is.
+# The weight of the newest picture in the estimate.
 NEWEST = 0.5
 
 

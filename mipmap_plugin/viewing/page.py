@@ -58,11 +58,11 @@ class PageSettings:
 class _Seen:
     """What a browser shows."""
 
-    view: tuple[Pose, int, int]  # with the width and height of its canvas, px
-    look: Look
-    version: int
-    since: float  # when the camera last moved
-    whole: bool  # the picture has all its pixels
+    view: tuple[Pose, int, int] | None = None  # with the width and height of its canvas, px; None: nothing was drawn yet
+    look: Look | None = None
+    version: int = 0
+    since: float = 0.0  # when the camera last moved
+    whole: bool = False  # the picture has all its pixels
 
 
 class Page:
@@ -98,7 +98,7 @@ class Page:
                 self._tried(self._settle)
 
     def _tried(self, work: Callable[..., bool | None], *of: Any) -> bool | None:
-        """What `work` returns. What goes wrong is told on the page and does not end it, neither for other browsers nor for what waits to be saved."""
+        """Call `work`. Its errors are shown on the page and do not end it, because other browsers use it, and a result may wait to be saved."""
         try:
             return work(*of)
         except Exception as error:
@@ -156,16 +156,16 @@ class Page:
         return pose_of(view, self._stage.sampling.of(view).depth)
 
     def _serve(self, number: int, client: Any) -> bool:
-        """Draw what a browser's camera sees, if that is something new: coarsely while it moves, in full once it is still; whether nothing was."""
-        view, look, now, seen = _view(client), self._controls.look(), time.monotonic(), self._seen.get(number)
-        moved = seen is None or seen.view != view
+        """Draw what a browser's camera sees if that has changed, coarsely while it moves, in full once it is still; return whether nothing had."""
+        view, look, now, seen = _view(client), self._controls.look(), time.monotonic(), self._seen.get(number, _Seen())
         version = self._version
-        if seen is not None and not moved and seen.whole and (seen.look, seen.version) == (look, version):
+        is_same = (seen.view, seen.look, seen.version) == (view, look, version)
+        if is_same and seen.whole:
             return True
-        since = now if seen is None or moved else seen.since
+        since = seen.since if seen.view == view else now
         _, width, height = view
         coarse = self._pace.fraction(width * height // look.pixel**2) if now - since < STILL_S else 1.0
-        if seen is not None and not moved and coarse < 1 and (seen.look, seen.version) == (look, version):
+        if is_same and coarse < 1:
             return False
         self._seen[number] = _Seen(view, look, version, since, coarse == 1)
         self._draw(client, look, view, coarse)
@@ -206,7 +206,7 @@ class Page:
             _move(client, self._slid_to[number])
 
     def _go(self, event: Any) -> None:
-        """Move the camera to a view of the scene. The list is a menu: viser tells of no choice that stands there already."""
+        """Move the camera to a view of the scene, and reset the list: viser does not report that the same entry is chosen again."""
         view = self._views.get(self._controls.view.value)
         if event.client is not None and view is not None:
             self._slider_of = None  # the new view has a zoom of its own

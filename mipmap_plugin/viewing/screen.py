@@ -19,10 +19,10 @@ from mipmap_plugin.splatting.rotations import quaternions, rotations
 # Vertical fields of view, radians: below the first nothing is left of a scene, above the second splats are stretched beyond recognition.
 LEAST_FOV, LARGEST_FOV = math.radians(0.5), math.radians(110)
 
-# Rounds in which a zoom is found: it is that of the median splat in the picture, and another picture has another one.
+# Iterations to find the pose of a zoom: the zoom is that of the median splat in the picture, and another picture has another median.
 ROUNDS = 8
 
-# The median of at most so many splats, evenly spread, is that of all; and that of so many views.
+# Medians are computed of at most so many splats, and so many views, evenly spread.
 MOST_SPLATS, MOST_VIEWS = 100_000, 16
 
 

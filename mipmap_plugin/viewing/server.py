@@ -14,7 +14,7 @@ from typing import Any
 
 from mipmap_plugin.errors import SettingsError, install
 
-# Where a proxy stands between, its user has to know what is wrong, as the page only waits.
+# Said on the terminal, because the page itself only waits: the page may be the right one behind a proxy.
 FOREIGN = "a page of {origin} asked for this one's pictures, and got none; if it is this one behind a proxy, let it pass on Host or X-Forwarded-Host"
 
 # viser warns, in our name, of a picture for a browser that was closed while it was drawn.
@@ -37,8 +37,10 @@ def served(host: str, port: int) -> Any:
 
 @contextlib.contextmanager
 def _own_pages_only() -> Iterator[None]:
-    """Let pages of others not talk to what viser serves inside the block, for which it has no setting: a browser lets each of its pages reach this
-    machine, and so see the scene, adapt and save."""
+    """Let what viser serves inside the block refuse connections of other web pages, for which viser has no setting.
+
+    A browser lets every page connect to this machine, so that a foreign one could see the scene, adapt and save.
+    """
     server: Any = import_module("websockets.asyncio.server")  # an extra's, whose types mypy may lack
     serve = server.serve
 
@@ -66,7 +68,7 @@ def foreign_page(headers: Mapping[str, str]) -> bool:
 
 
 def without_words() -> contextlib.AbstractContextManager[Any]:
-    """viser prints that it starts and stops, quiet or not; what is to be said is said by the command."""
+    """Discard what viser prints when it starts and stops, for it does so even if told to be quiet."""
     return contextlib.redirect_stdout(io.StringIO())
 
 

@@ -39,6 +39,12 @@ def test_a_job_that_travels_makes_the_same_bytes(tmp_path, given):
     assert failed.status == "failed" and "nobody" in failed.reason
 
 
+def test_the_report_of_a_job_that_traveled_names_no_folder_of_the_worker(tmp_path):
+    job = job_of(tmp_path)
+    delivery = do_parcel(pack(job), run_job)
+    assert delivery.outcome.status == "done" and delivery.outcome.report["cameras_from"] == {}
+
+
 def test_files_that_are_links_travel_as_what_they_are_links_to(tmp_path):
     """Checkpoints and photographs on another disk often are links, files and folders."""
     disk, folder = tmp_path / "disk", tmp_path / "base"

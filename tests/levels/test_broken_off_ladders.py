@@ -213,3 +213,9 @@ def test_levels_of_another_ladder_are_not_taken(tmp_path, monkeypatch):
     (tmp_path / "other" / "file").write_text("mine")
     with pytest.raises(SettingsError, match="it has other things in it"):
         make_levels(wrapped(), request(), resume=tmp_path / "other")
+
+
+@pytest.mark.parametrize("by", ["zoom", "distance"])
+def test_what_is_no_path_to_go_on_from_is_named(by):
+    with pytest.raises(SettingsError, match=r"^resume must be a text .*, got int$"):
+        make_levels(wrapped(), request(by=by), resume=5)

@@ -88,7 +88,7 @@ def test_splats_in_no_picture_have_no_part_in_the_rule():
     base, cluttered = (wrap_model(VanillaModel.from_gaussians(together(parts), tiny.model(1).trained), cameras=views, backend="cpu", threads=1)
                        for parts in ([ball], [ball, *hidden]))  # fmt: skip
     request = LadderRequest("playcanvas", coarsest=1 / 8)
-    rules = [scene_of(each, request, request.first_band(each.target("playcanvas"), each.effects())) for each in (base, cluttered)]
+    rules = [scene_of(each, request, request.first_band(each)) for each in (base, cluttered)]
     assert rules[0].rule == rules[1].rule and rules[0].near == rules[1].near and rules[0].extent == rules[1].extent
     assert not by_distance(cluttered, replace(request, viewer="supersplat", by="auto"))
 
@@ -237,7 +237,7 @@ def test_a_base_that_integrates_over_pixels_is_refused_before_any_work(monkeypat
 
 def test_walks_begin_where_something_is_seen(small_chunks, monkeypatch):
     base, request = wrapped(), LadderRequest("classic", coarsest=1 / 4, ratio=2.0, by="distance")
-    scene = scene_of(base, request, request.first_band(base.target("classic"), base.effects()))
+    scene = scene_of(base, request, request.first_band(base))
     away = from_x(1e6)
     assert math.isinf(foreground(away, scene.splats.means, scene.target.near_plane))
     monkeypatch.setattr("mipmap_plugin.levels.distance.yardstick.jittered", lambda views, count, generator: [away, views[0]])
@@ -248,7 +248,7 @@ def test_walks_begin_where_something_is_seen(small_chunks, monkeypatch):
 def test_a_place_is_measured_once_where_levels_end_before_walks_begin(small_chunks):
     """The nearest parts of this scene are nearer than what most views have before them."""
     base, request = wrapped(), LadderRequest("classic", coarsest=1 / 4, ratio=1.3, by="distance")
-    scene = scene_of(base, request, request.first_band(base.target("classic"), base.effects()))
+    scene = scene_of(base, request, request.first_band(base))
     walks = Walks(scene, [base.model] * scene.rule.count)
     pixels = [[walks.seen(view, size).pixel for view in walks.views] for size in walks.places()]
     assert len(walks.places()) < 1 + 2 * scene.rule.count and walks.places()[0] == 0

@@ -13,7 +13,7 @@ from mipmap_plugin import cli, load_model, wrap_model
 from mipmap_plugin.adaptation.optimization.validation import Validation
 from mipmap_plugin.commands.levels import print_summary
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.levels.distance.ladder import _first, by_distance, scene_of
+from mipmap_plugin.levels.distance.ladder import by_distance, scene_of
 from mipmap_plugin.levels.distance.level import AS_FINER, LevelRun
 from mipmap_plugin.levels.manifest import MANIFEST, read_manifest
 from mipmap_plugin.levels.request import LadderRequest
@@ -69,8 +69,8 @@ def test_a_level_that_no_step_betters_is_not_merged_at_any_cost(small_chunks, mo
     finer, formed, merged = db
     base, coarser = wrapped(), LevelRun._coarser
     request = LadderRequest.of("classic", by="distance", coarsest=1 / 4, ratio=2.0, **BRIEF | {"steps": 0})
-    band = request.first_band(base.target("classic"), base.effects())
-    first, quality = _first(base, request, band, None).model, {}
+    band = request.first_band(base)
+    first, quality = base.adapt(1.0, **request.for_first(base, band)).model, {}
 
     def noted(self, weights, kept):
         student = coarser(self, weights, kept)

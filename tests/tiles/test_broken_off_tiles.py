@@ -158,7 +158,7 @@ def test_a_run_that_is_interrupted_anywhere_goes_on_to_the_same_bytes(job, monke
             patched.setattr(steering, "psnr", lambda *_: start_db + next(own))
             real_steer(scene, made)
 
-    monkeypatch.setattr(steering, "steer", steer)
+    monkeypatch.setattr("mipmap_plugin.tiles.job.steer", steer)
     plan = [Sweep(0, 0, (1,), 0, 0), Sweep(1, 1, (2, 4), 1, 1), Sweep(2, 4, (5, 6), 2, 2)]
     monkeypatch.setattr("mipmap_plugin.tiles.scene.sweeps", lambda config: plan)
     job = replace(job, settings=job.settings | {"steps": 6, "warm_up": 0.0})

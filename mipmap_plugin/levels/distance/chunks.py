@@ -17,8 +17,8 @@ LEAST = 1024 * SMALLEST_CHUNK
 # The same of the base alone, before there are levels: a ladder has some times as many.
 LEAST_OF_BASE = LEAST // 4
 
-# PlayCanvas's `lodDistanceShrink`: the part that is left out of distances of what a box's side is longer than those of half of the chunks. A few
-# large splats would make a box so long that a camera is always inside.
+# PlayCanvas's `lodDistanceShrink`: a side of a chunk's box that is longer than the median chunk's loses this fraction of the difference before
+# distances are measured. Otherwise a few large splats would make a box so long that a camera is always inside.
 SHRINK = 0.75
 
 
@@ -87,6 +87,6 @@ class Chunks:
 
 
 def shrunk(half: Tensor) -> Tensor:
-    """Half the sides [C, 3] of the boxes that PlayCanvas measures distances to, from those of the chunks' own boxes, [C, 3]."""
+    """Half extents [C, 3] of the boxes that PlayCanvas measures distances to, from those of the chunks' own boxes [C, 3] (`SHRINK`)."""
     usual = half.sort(dim=0).values[len(half) // 2]
     return half - SHRINK * (half - usual).clamp_min(0)

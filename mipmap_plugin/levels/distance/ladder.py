@@ -36,15 +36,15 @@ CHUNK = 0.5
 REPEATED = "nothing was better than the finer level as it is"
 
 
-def make_levels_by_distance(base: FrozenBase, request: LadderRequest, resume: str | Path | None = None) -> Ladder:
+def make_levels_by_distance(base: FrozenBase, request: LadderRequest, resume: Path | None = None) -> Ladder:
     """Make the levels. `resume`: as for `levels.ladder.make_levels`. Raises what that raises, and SettingsError for a model whose splats cannot be
     merged, or for settings that levels by distance do not have."""
     refuse(base, request)
-    band = request.first_band(base.target(request.viewer), base.effects())
+    band = request.first_band(base)
     with announced("cutting the scene into chunks"):
         scene = scene_of(base, request, band)
-        store = LevelStore(None if resume is None else Path(resume), base, request)
-    first = store.level("level_0", lambda state: _first(base, request, band, state))
+        store = LevelStore(resume, base, request)
+    first = store.level("level_0", lambda state: base.adapt(1.0, resume=state, **request.for_first(base, band)))
     with threads.limited_for(scene.backend, base.threads):
         levels = [first]
         for number in range(1, scene.rule.count):
@@ -107,10 +107,3 @@ def scene_of(base: FrozenBase, request: LadderRequest, band: Band) -> Scene:
 def chunk_extent(distance: float) -> int:
     """The largest side of a chunk in world units, for a scene whose nearest parts are at this distance."""
     return max(1, round(CHUNK * distance))
-
-
-def _first(base: FrozenBase, request: LadderRequest, band: Band, state: Path | None) -> Adapted:
-    """x1: the base, converted to the viewer unless that draws it as its training did."""
-    as_it_is = base.target(request.viewer) == base.effects()
-    converted = {} if as_it_is else band.settings()
-    return base.adapt(1.0, resume=state, **{"recipe": request.recipe, "viewer": request.viewer, **converted, **request.settings})

@@ -46,7 +46,7 @@ from mipmap_plugin.progress import announced
 # Samples of the truth per pixel along each side.
 SAMPLES = 2
 
-# The finer level, of which a level is made, and which it replaces farther away.
+# What the state is called in which a level is the finer one, unchanged.
 AS_FINER = "the finer level as it is"
 
 # A view is used at least so many times in a run, because its truth costs as much as several steps.
@@ -55,7 +55,7 @@ USES = 6
 
 @dataclass(frozen=True)
 class WalkTask(Task):
-    """A task whose steps are in pixels of the level, not in those of the median splat, which may be far away and not move."""
+    """A task whose rates are in pixels of the level, and not in those at the median splat, which may be far away and not move."""
 
     size: float = 1.0  # world units
 
@@ -227,5 +227,5 @@ class LevelRun:
 
 
 def _most_views(config: AdaptConfig) -> int:
-    """How many views are worth their truth."""
+    """The number of views above which a view would be used too rarely to be worth its truth (`USES`)."""
     return max(config.validation_views, config.steps * config.views_per_step // USES)

@@ -9,14 +9,10 @@ from statistics import fmean
 from typing import Any
 
 from mipmap_plugin.adaptation.adapted import Adapted
-from mipmap_plugin.formats.atomic import new_folder, sha256, write_json
 from mipmap_plugin.levels.contents import LeftOut
 from mipmap_plugin.levels.distance.scene import Scene
 from mipmap_plugin.levels.distance.yardstick import TRUTH, WalkPoint
-from mipmap_plugin.levels.manifest import FORMAT, MANIFEST, level_name, refuse_ladder
-
-# px: the shorter side of the canvas that `distances` are written for; they are in proportion to it.
-CANVAS = 1080
+from mipmap_plugin.levels.manifest import CANVAS, FORMAT, file_facts, refuse_ladder, write_levels
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,12 +26,9 @@ class Contents:
 
 
 def write(ladder: Contents, folder: Path, overwrite: bool) -> Path:
-    """Write the levels, a report beside each, and the manifest; the folder appears complete or not at all. Raises OutputExists, OutputError."""
+    """`write_levels` of a ladder by distance."""
     refuse_ladder(folder, ladder.scene.base, overwrite=overwrite)
-    with new_folder(folder, overwrite) as temporary:
-        files = [level.save(temporary / level_name(number)) for number, level in enumerate(ladder.levels)]
-        write_json(temporary / MANIFEST, manifest(ladder, files), overwrite=False)
-    return folder
+    return write_levels(ladder.levels, lambda files: manifest(ladder, files), folder, overwrite)
 
 
 def manifest(ladder: Contents, files: list[Path]) -> dict[str, Any]:
@@ -78,9 +71,6 @@ def _entry(ladder: Contents, number: int, file: Path) -> dict[str, Any]:
         "distance_from": low * to_distance,
         "distance_to": None if last else high * to_distance,
         "splats": level.report.gaussians_after,
-        "bytes": file.stat().st_size,
-        "sha256": sha256(file),
-        "seconds": level.report.seconds.get("total", 0.0),
-        "holds": level.report.returned,
+        **file_facts(file, level.report),
         "psnr_db": {f"{ladder.scene.near / point.pixel:.4g}": point.psnr_db for point in ladder.curve if point.level == number},
     }

@@ -19,21 +19,21 @@ from mipmap_plugin.adaptation.pixel_size import seen_pixel_size
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.levels.request import Band, LadderRequest
 
-# The fraction of splats that were seen with smaller pixels than what counts as the nearest parts of a scene: floaters lie before a camera.
+# The quantile of the sizes of pixels at a scene's splats that stands for its nearest parts. The smallest would be that of floaters before a camera.
 NEAREST = 0.05
 
-# A scene whose pixels differ by more than this between its near and its far parts is unbounded: of lego's 1.3, of flowers' 16.
+# A scene is unbounded if its pixels are more than this many times as large at its far parts as at its near ones: 1.3 times for lego, 16 for flowers.
 UNBOUNDED = 3.0
 
 
 @dataclass(frozen=True)
 class DistanceRule:
-    """Which level is shown where a pixel has which size. Sizes are in world units, distances in world units times px / px."""
+    """Which level is shown where a pixel has which size, in world units."""
 
     first: float  # level 0 is shown up to this size of a pixel
     ratio: float  # level k up to first · ratio^k
-    count: int  # of levels, level 0 included; the last is shown at any larger size
-    left_out: int = 0  # of further levels, in whose places the last is shown
+    count: int  # the number of levels, level 0 included; the last is shown at any larger size
+    left_out: int = 0  # the number of further levels that were made and left out; the last is shown in their place
 
     @classmethod
     def of(cls, pixels: Tensor, request: LadderRequest, band: Band) -> DistanceRule:
@@ -56,7 +56,7 @@ class DistanceRule:
         return (self.first * float(self.ratio ** (level - 1)) if level else 0.0), self.first * float(self.ratio**level)
 
     def middle(self, level: int) -> float:
-        """The size of a pixel that a level is merged for: the middle of its ends; of level 0, which has but one, as far before that."""
+        """The size of a pixel that a level is merged for: the middle of its ends in the logarithm, if level 0 counts as wide as the others."""
         return self.first * float(self.ratio ** (level - 0.5))
 
     def playcanvas(self, canvas: int) -> tuple[float, float]:
@@ -65,7 +65,7 @@ class DistanceRule:
 
 
 def nearest(pixels: Tensor) -> float:
-    """The size of a pixel at the nearest parts of a scene, of the sizes [N] at its splats that are seen, at least one."""
+    """The size of a pixel at the nearest parts of a scene, from the sizes [N] at its splats that are seen, at least one (`NEAREST`)."""
     return float(_quantile(pixels, NEAREST))
 
 

@@ -40,23 +40,23 @@ class Scene:
     request: LadderRequest
     rule: DistanceRule
     chunks: Chunks  # of the base alone: what levels are made with
-    extent: int  # world units, of a chunk
+    extent: int  # the largest extent of a chunk, world units
     target: Effects
     backend: Backend
     note: str  # which backend, and why
 
     @cached_property
     def splats(self) -> Gaussians:
-        """The base's own."""
+        """The splats of the base."""
         return self.splats_of(self.base.model)
 
     def splats_of(self, model: SplatModel) -> Gaussians:
-        """Those of a level, without gradients."""
+        """The splats of a level, without gradients."""
         return model.gaussians(self.base.any_camera()).detach()
 
     @cached_property
     def views(self) -> list[Camera]:
-        """Those of the training that see something."""
+        """The views of the training that see something."""
         return seeing(self.base.views(), self.splats.means, self.target.near_plane)
 
     def pixel_of(self, means: Tensor) -> Tensor:
@@ -72,12 +72,12 @@ class Scene:
         return min(1.0, self.near / self.rule.middle(level)) if level else 1.0
 
     def config(self, level: int) -> AdaptConfig:
-        """The settings of a level. Rows stay what they are, because those of the finer level come first."""
+        """The settings of a level. Nothing is pruned, so that the rows of the finer level, which come first, keep their places."""
         config = affordable_for(self.asked(level), self.splats.means, self.views, self.target.near_plane)
         return fitting(config, self.base.effects()).model_copy(update={"prune_every": max(1, config.steps)})
 
     def asked(self, level: int) -> AdaptConfig:
-        """The settings of a level in a scene of any size."""
+        """The settings of a level, before the size of the scene reduces its steps (`config`)."""
         return make_config(self.request.recipe, min(BELOW_1, self.scale(level)), merge_to=1.0, **self.request.settings)
 
     def unmade(self, finest: Gaussians, level: int) -> Gaussians:
@@ -89,7 +89,7 @@ class Scene:
         return replace(finest, scales=scales, opacities=opacities)
 
     def walked(self, view: Camera, level: int, number: int) -> Camera:
-        """The view from as far back as the level is seen from: of one in three views anywhere up to there, of the others right there."""
+        """The `number`-th view, moved back so that the level is shown: two in three views by the whole way, each third by a part of it."""
         low, high = self.rule.ends(level)
         size = low * (high / low) ** ((number + 0.5) * GOLDEN % 1)
         way = max(0.0, size * focal_of(view) - foreground(view, self.splats.means, self.target.near_plane))

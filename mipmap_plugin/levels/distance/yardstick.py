@@ -78,8 +78,10 @@ class Walks:
         return Seen((depth + way) / focal_of(view), way, truth, mixture, base, len(shown))
 
     def places(self) -> list[float]:
-        """Where walks are looked at: sizes of a pixel at what is nearest, rising; 0, where they begin, then the middle and the end of each level, but
-        not where a walk has yet to begin: the first levels may end before, and it would be the same picture again."""
+        """Where walks are looked at, as rising sizes of a pixel at what is nearest: 0, where they begin, then the middle and the end of each level.
+
+        Places before the beginning of all walks, where the first levels may end, are left out: they would show the same pictures again.
+        """
         return [0.0, *(size for size in places(self._scene.rule) if any(self._way(view, size) for view in self.views))]
 
     def _way(self, view: Camera, size: float) -> float:
