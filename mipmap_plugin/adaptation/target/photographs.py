@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.target.resize import resize
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.errors import SettingsError, type_of
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.base import Placed, SplatModel
@@ -24,6 +24,9 @@ from mipmap_plugin.scenes.base import SHAPE_TOLERANCE, SPLIT
 
 # Cameras are in a world if they are nearer to its cameras than to those of the other by this factor: in neither, one is nearer by chance.
 FAR_NEARER = 0.1
+
+# Cameras that tell in which world all of them are.
+LOOKED_AT = 256
 
 
 class Photographs:
@@ -134,6 +137,11 @@ def _unapplied(scene: Scene, cameras: Sequence[Camera]) -> Scene:
 
 def _apart(scene: Scene, cameras: Sequence[Camera]) -> float:
     """How far cameras of a scene and of a base are from the nearest of the other, median, in world units; one may have but some of the other's."""
-    there, here = (torch.stack([camera.center for camera in each]) for each in (scene.cameras, cameras))
-    distances = torch.cdist(there, here, compute_mode="donot_use_mm_for_euclid_dist")
-    return min(float(distances.amin(axis).median()) for axis in (0, 1))
+    pairs = (scene.cameras, cameras), (cameras, scene.cameras)
+    return min(_to_nearest(evenly(some, LOOKED_AT), others) for some, others in pairs)
+
+
+def _to_nearest(some: Sequence[Camera], others: Sequence[Camera]) -> float:
+    """How far `some` cameras are from the nearest of the `others`, median, in world units."""
+    these, those = (torch.stack([camera.center for camera in each]) for each in (some, others))
+    return float(torch.cdist(these, those, compute_mode="donot_use_mm_for_euclid_dist").amin(1).median())
