@@ -73,10 +73,11 @@ def at_density_of(cameras: Sequence[Camera], base: Sequence[Camera]) -> list[Cam
     kinds, named = {(*view.size, view.fx, view.fy): view for view in base}, defaultdict[str, list[Camera]](list)
     for view in base:
         named[Path(view.name).stem].append(view)  # several, where images of several folders have the same names
+    similar, similar_of_name = MostSimilar(list(kinds.values())), {name: MostSimilar(views) for name, views in named.items()}
 
     def at_density(camera: Camera) -> Camera:
         own = named.get(Path(camera.name).stem, [])
-        view = min(own or kinds.values(), key=lambda view: _difference(view, camera))
+        view = similar_of_name.get(Path(camera.name).stem, similar)(camera)
         ratio = view.fx / camera.fx
         resized = camera.resized(max(1, round(camera.width * ratio)), max(1, round(camera.height * ratio)))
         if camera.index is None and len(own) == 1 and view.split == camera.split:
@@ -91,10 +92,23 @@ def _is_centered(camera: Camera) -> bool:
     return math.isclose(2 * camera.cx, camera.width) and math.isclose(2 * camera.cy, camera.height)
 
 
-def _difference(one: Camera, other: Camera) -> float:
-    """How much the fields of view of two cameras differ along both axes: the sum of the logarithms of their ratios."""
-    ratios = one.width / one.fx * other.fx / other.width, one.height / one.fy * other.fy / other.height
-    return sum(abs(math.log(ratio)) for ratio in ratios)
+class MostSimilar:
+    """Finds among views the one whose field of view differs least along both axes: by the sum of the logarithms of its ratios.
+
+    It compares with all at once, for each of 10,000 cameras may have a lens of its own.
+    """
+
+    def __init__(self, views: Sequence[Camera]) -> None:
+        self._views = views
+        self._fields = torch.tensor([_field(view) for view in views], dtype=torch.float64)
+
+    def __call__(self, camera: Camera) -> Camera:
+        return self._views[int((self._fields - self._fields.new_tensor(_field(camera))).abs().sum(1).argmin())]
+
+
+def _field(camera: Camera) -> tuple[float, float]:
+    """The field of view along both axes, by the logarithm of the picture's size in focal lengths."""
+    return math.log(camera.width / camera.fx), math.log(camera.height / camera.fy)
 
 
 def scene_of(model: SplatModel, images: Scene | str | Path) -> Scene:
