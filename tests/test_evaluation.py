@@ -299,6 +299,12 @@ def test_a_checkpoint_without_cameras_cannot_be_judged(scene):
         evaluate(wrap_model(tiny.model()), scene, [1], [], "P3")
 
 
+@pytest.mark.parametrize("name", ["P2", None])
+def test_an_unknown_protocol_is_refused_by_name(model, scene, name):
+    with pytest.raises(SettingsError, match=f"there is no protocol '{name}'; choose from P1, P3, P4"):
+        evaluate(model, scene, [1], [], name)
+
+
 def test_rows_as_text_and_as_records(model, scene):
     rows = evaluate(model, scene, [1, 1 / 4], [], "P3")
     lines = table(rows).splitlines()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from largest import Largest
 from PIL import Image
 from torch_checkpoints import gsplat_folder, splatfacto_folder, splats
 
@@ -119,6 +120,16 @@ def test_applied_transform_is_taken_back_for_some_of_the_views_and_not_for_camer
     scene = Scene(tuple(view.moved(applied) for view in views[:there]), {}, tmp_path, [], applied=applied)
     base = wrap_model(tiny.model(), cameras=[view if turned else view.moved(third) for view in views[:here]])
     assert (base.place(scene) is not scene) == turned
+
+
+def test_thousands_of_cameras_tell_their_world_without_a_number_for_each_pair(tmp_path, monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.adaptation.target.photographs.LOOKED_AT", 8)
+    applied = torch.tensor([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
+    views = tiny.cameras(60)
+    scene = Scene(tuple(view.moved(applied) for view in views), {}, tmp_path, [], applied=applied)
+    with Largest() as largest:
+        assert wrap_model(tiny.model(), cameras=views).place(scene) is not scene
+    assert largest.numbers < 60 * 20
 
 
 def test_gsplat_holds_out_the_views_that_its_options_say(tmp_path):

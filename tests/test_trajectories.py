@@ -5,13 +5,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from largest import Largest
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import NEAR_PLANE
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.scenes import jittered, load_scene, orbit
 from mipmap_plugin.scenes.orbits import TIGHT, Orbit, frame, guess_up
-from mipmap_plugin.scenes.trajectories import BEYOND, rotation_matrix, rotation_vector
+from mipmap_plugin.scenes.trajectories import BEYOND, CANDIDATES, rotation_matrix, rotation_vector
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -247,6 +248,15 @@ def test_jittered_is_the_same_only_for_the_same_seed():
     first, again, other = (poses(jittered(ring(), 6, seeded(seed))) for seed in (1, 1, 2))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
+
+
+def test_views_around_thousands_of_cameras_need_no_number_for_each_pair(monkeypatch):
+    """Of 10,000 cameras such tensors took 3 GB."""
+    cameras, before = ring(100), jittered(ring(100), 5, seeded())
+    monkeypatch.setattr("mipmap_plugin.scenes.trajectories.BLOCK", 7)
+    with Largest() as largest:
+        views = jittered(cameras, 5, seeded())
+    assert largest.numbers <= 5 * CANDIDATES * 100 and torch.equal(poses(views), poses(before))
 
 
 def test_a_single_camera_is_rotated_in_place():

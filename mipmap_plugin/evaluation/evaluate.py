@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.errors import SettingsError, unknown
 from mipmap_plugin.evaluation.cells import Cells
 from mipmap_plugin.evaluation.measure import (
     FILTERS,
@@ -158,6 +159,8 @@ def evaluator_of(
     model: Wrapped, scene: Scene, protocol: str, perceptual: Perceptual | None = None, cells: Cells | None = None
 ) -> Evaluator:
     """What compares a model with the photographs of its scene; `cells`: where finished rows are kept. Raises SettingsError."""
+    if protocol not in (names := [*PROTOCOLS]):
+        raise SettingsError(unknown("protocol", str(protocol), names))
     scene = model.place(scene)
     views, notes = views_of_placed(model, scene), [*scene.notes, *not_held_out(model, scene)]
     return Evaluator(views, PROTOCOLS[protocol], perceptual, scene.source.name, cells=cells or Cells(), notes=notes)

@@ -150,14 +150,35 @@ def views_seen(judged: Sequence[Camera], adapted: Sequence[Camera]) -> list[Came
         return []
     views = [*judged, *adapted]
     reach = max(SAME_PLACE * extent(views), SAME_DIGITS * max(float(view.center.norm()) for view in views))
-    near = _distances(judged, adapted, lambda view: view.center) < reach
-    aligned = _distances(judged, adapted, lambda view: view.viewmat[:3, :3].flatten()) < SAME_ROTATION
-    other_time = _distances(judged, adapted, lambda view: view.center.new_tensor([math.nan if view.time is None else view.time])) > SAME_TIME
-    same = near & aligned & ~other_time  # an unknown time is NaN, which counts as the same
-    return [view for view, seen in zip(judged, same.any(dim=1).tolist(), strict=True) if seen]
+    first, second = _facts(judged), _facts(adapted)
+    begin, counts, order = _candidates(first, second, first.new_tensor([reach] * 3 + [SAME_ROTATION] * 9 + [SAME_TIME]))
+    left, number = counts.nonzero()[:, 0], 0  # the judged views that are not found yet and have a candidate of that number
+    seen = torch.zeros(len(judged), dtype=torch.bool)
+    while len(left):
+        apart = first[left] - second[order[begin[left] + number]]
+        other_time = apart[:, 12].abs() > SAME_TIME  # an unknown time is NaN, which counts as the same
+        seen[left] = (apart[:, :3].norm(dim=1) < reach) & (apart[:, 3:12].norm(dim=1) < SAME_ROTATION) & ~other_time
+        number += 1
+        left = left[~seen[left] & (counts[left] > number)]
+    return [view for view, known in zip(judged, seen.tolist(), strict=True) if known]
 
 
-def _distances(first: Sequence[Camera], second: Sequence[Camera], value: Callable[[Camera], Tensor]) -> Tensor:
-    """[F, S]: the distances between the values of two lists of views."""
-    first_values, second_values = (torch.stack([value(view) for view in views]) for views in (first, second))
-    return torch.cdist(first_values, second_values, compute_mode="donot_use_mm_for_euclid_dist")  # exact for small distances
+def _facts(views: Sequence[Camera]) -> Tensor:
+    """What tells views apart, [V, 13] float64: center, rotation, and time, NaN if it is unknown."""
+    poses = torch.stack([torch.cat([view.center, view.viewmat[:3, :3].flatten()]) for view in views])
+    times = poses.new_tensor([math.nan if view.time is None else view.time for view in views])
+    return torch.cat([poses, times[:, None]], dim=1)
+
+
+def _candidates(first: Tensor, second: Tensor, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """For each row of `first` [F, D] the rows of `second` [S, D] within `reach` [D] by one column, that which leaves fewest.
+
+    They are `order[begin : begin + count]`; returns the begins [F], the counts [F], and the order [S].
+    """
+    found = []
+    for ours, theirs, most in zip(first.T, second.T, reach, strict=True):
+        if not (ours.isnan().any() or theirs.isnan().any()):
+            ordered, order = theirs.sort()
+            begin = torch.searchsorted(ordered, ours - most)
+            found.append((begin, torch.searchsorted(ordered, ours + most, right=True) - begin, order))
+    return min(found, key=lambda column: int(column[1].sum()))

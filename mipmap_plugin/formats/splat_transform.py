@@ -185,14 +185,14 @@ def _convert(tool: Sequence[str], plain: Path, converted: Path, path: Path) -> N
     as_it_is = None
     if kind == "spz":
         from mipmap_plugin.formats.ply import read_ply  # as above
-        from mipmap_plugin.formats.spz import refine_harmonics
+        from mipmap_plugin.formats.spz import refine
 
         as_it_is = read_ply(plain).columns  # in the frame of the file
     _settle_frame(tool, converted, plain)
     if reason := _run(tool, [plain], converted):
         raise OutputError(f"{path}: {TOOL} does not write it ({reason})")
     if as_it_is is not None:
-        refine_harmonics(converted, as_it_is)
+        refine(converted, as_it_is)
     if _mode(plain) == "antialiased" and not _mode(converted, kind):
         mark_antialiased(converted)
 

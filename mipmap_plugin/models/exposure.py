@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from os.path import splitext
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,11 @@ class Exposures:
     matrices: Mapping[str, Tensor] = field(default_factory=dict)  # [3, 4] float64 by image name
     why_none: str = EXPOSURE.reason
 
-    @property
+    @cached_property
+    def _without_suffix(self) -> dict[str, Tensor]:
+        return {splitext(name)[0]: matrix for name, matrix in self.matrices.items()}
+
+    @cached_property
     def changed(self) -> int:
         """The number of matrices that are not the identity."""
         return sum(not torch.equal(matrix, torch.eye(3, 4, dtype=matrix.dtype)) for matrix in self.matrices.values())
@@ -46,8 +51,7 @@ class Exposures:
         """The matrix [3, 4] float64 of the image with the name of `camera`, with or without suffix. Raises SettingsError if there is none."""
         if not self.matrices:
             raise SettingsError(f"exposure: {self.summary()}; leave it out")
-        without_suffix = {splitext(name)[0]: matrix for name, matrix in self.matrices.items()}
-        matrix = self.matrices.get(camera.name, without_suffix.get(camera.name))
+        matrix = self.matrices.get(camera.name, self._without_suffix.get(camera.name))
         if matrix is None:
             some = ", ".join(list(self.matrices)[:5])
             raise SettingsError(f"view {camera.name!r} has no exposure; the first of {len(self.matrices)} that have one are {some}")

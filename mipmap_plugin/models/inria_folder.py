@@ -100,13 +100,14 @@ def write_folder(target: Path, source: Path | None, cfg_args: str, iteration: in
 def cfg_args_for(source: Path | None, target: Path, trained: TrainedScale, sh_degree: int) -> str:
     """The text of the new cfg_args: the source's own if SH degree and screen filter agree, else its options, or the defaults of 3DGS.
 
-    Options that determine another screen filter are left out, because readers of the folder would use it.
+    Options that determine another screen filter are left out, because readers of the folder would use it. Whether views were held out (`eval`) is
+    None where it is not known: no --eval to 3DGS, which asks for the option.
     """
     options, _ = read_options(source)
     fits = not any(name in options for name in FILTER_OPTIONS) or _screen_filter(options, None) == (trained.screen_filter, trained.eps2d)
     options = {name: value for name, value in options.items() if fits or name not in FILTER_OPTIONS}
     if fits and source is not None and options.get("sh_degree") == sh_degree:
         return (source / "cfg_args").read_bytes().decode("utf-8")
-    usual = {"source_path": "", "model_path": str(target), "images": "images", "resolution": trained.resolution, "data_device": "cuda", "eval": False}
+    usual = {"source_path": "", "model_path": str(target), "images": "images", "resolution": trained.resolution, "data_device": "cuda", "eval": None}
     white = trained.background == (1.0, 1.0, 1.0)
     return format_cfg_args({**usual, "white_background": white, **options, "sh_degree": sh_degree})

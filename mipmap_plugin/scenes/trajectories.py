@@ -18,6 +18,9 @@ from mipmap_plugin.scenes.orbits import Orbit
 NEIGHBORS = 16
 BEYOND = 0.25
 
+# Cameras whose distances to all others are in memory at once: those of 10,000 to each other, and what is made of them, take 3 GB.
+BLOCK = 64
+
 # Of a camera's neighbors, by distance, those after a gap are of another part of the capture, and nobody was on the way there. A gap is a distance GAP
 # times as large as the one before it; among the first RIG neighbors, which may be the cameras of a rig, there is none.
 GAP, RIG = 4.0, 4
@@ -127,17 +130,27 @@ def _on_arc(centers: Tensor, forwards: Tensor, along: Tensor) -> Tensor:
 
 def _neighbors(centers: Tensor, rotations: Tensor, index: Tensor, generator: torch.Generator) -> Tensor:
     """For each of `index` [V], a random one of the nearest cameras that look in a similar direction, [V]; itself if none does."""
-    traces = rotations.flatten(1) @ rotations.flatten(1).T  # of the rotation from one to the other, 1 + 2 cos(angle)
-    # By differences: products of matrices round so much that cameras in one place would be apart.
-    distances = torch.cdist(centers, centers, compute_mode="donot_use_mm_for_euclid_dist")
-    distances[(traces - 1) / 2 < math.cos(SAME_DIRECTION)] = math.inf
-    distances.fill_diagonal_(math.inf)
-    reach = _reach(distances)
-    distances[distances > torch.minimum(reach[:, None], reach)] = math.inf
-    distances, nearest = distances.topk(min(NEIGHBORS, len(centers)), largest=False)
-    known = distances.isfinite().sum(1)[index]
+    everyone = torch.arange(len(centers))
+    reach = torch.cat([_reach(_distances(centers, rotations, rows)) for rows in everyone.split(BLOCK)])
+    wanted, number = index.unique(return_inverse=True)
+    found = []
+    for rows in wanted.split(BLOCK):
+        distances = _distances(centers, rotations, rows)
+        distances[distances > torch.minimum(reach[rows, None], reach)] = math.inf
+        found.append(distances.topk(min(NEIGHBORS, len(centers)), largest=False))
+    known = torch.cat([distances.isfinite().sum(1) for distances, _ in found])[number]
     drawn = (torch.rand(len(index), generator=generator) * known).long()
-    return torch.where(known > 0, nearest[index, drawn], index)
+    return torch.where(known > 0, torch.cat([nearest for _, nearest in found])[number, drawn], index)
+
+
+def _distances(centers: Tensor, rotations: Tensor, rows: Tensor) -> Tensor:
+    """From the cameras of the numbers `rows` [R] to all others, [R, C]; infinity to those that look elsewhere, and to themselves."""
+    traces = rotations[rows].flatten(1) @ rotations.flatten(1).T  # of the rotation from one to the other, 1 + 2 cos(angle)
+    # By differences: products of matrices round so much that cameras in one place would be apart.
+    distances = torch.cdist(centers[rows], centers, compute_mode="donot_use_mm_for_euclid_dist")
+    distances.masked_fill_(traces < 1 + 2 * math.cos(SAME_DIRECTION), math.inf)
+    distances[torch.arange(len(rows)), rows] = math.inf
+    return distances
 
 
 def _reach(distances: Tensor) -> Tensor:

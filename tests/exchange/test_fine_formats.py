@@ -15,7 +15,7 @@ from PIL import Image
 
 from mipmap_plugin.formats.codebooks import codebook, palette
 from mipmap_plugin.formats.sog import completed, write_sog
-from mipmap_plugin.formats.spz import refine_harmonics
+from mipmap_plugin.formats.spz import refine
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
@@ -176,17 +176,44 @@ def test_a_palette_does_not_depend_on_the_callers_defaults():
         torch.set_default_dtype(torch.float32)
 
 
+def spz_of(columns, degree, version=3):
+    """As its usual writer makes it, with 12 bits of fractions; but all places and harmonics are 0, and what lies between is not of these splats."""
+    count = len(columns["x"])
+    header = struct.pack("<4sIIBBBB", b"NGSP", version, count, degree, 12, 1, 0)
+    return gzip.compress(header + bytes(9 * count) + bytes(range(11)) * count + bytes(count * 3 * ((degree + 1) ** 2 - 1)))
+
+
 def test_an_spz_has_its_harmonics_in_8_bits(tmp_path):
     columns = columns_of(20, degree=2)
-    body = bytes(range(20 * 20 % 256)) + bytes(20 * (9 + 1 + 3 + 3 + 4) - 20 * 20 % 256)
-    content = struct.pack("<4sIIBBBB", b"NGSP", 3, 20, 2, 12, 1, 0) + body
-    (tmp_path / "a.spz").write_bytes(gzip.compress(content + bytes(20 * 24)))
-    refine_harmonics(tmp_path / "a.spz", columns)
+    (tmp_path / "a.spz").write_bytes(spz_of(columns, 2))
+    refine(tmp_path / "a.spz", columns)
     written = gzip.decompress((tmp_path / "a.spz").read_bytes())
-    assert written.startswith(content) and len(written) == len(content) + 20 * 24
-    rest = (np.frombuffer(written[len(content) :], np.uint8).reshape(20, 8, 3).astype(float) - 128) / 128
+    assert written[16 + 9 * 20 : -20 * 24] == bytes(range(11)) * 20
+    rest = (np.frombuffer(written[-20 * 24 :], np.uint8).reshape(20, 8, 3).astype(float) - 128) / 128
     expected = np.stack([columns[f"f_rest_{i}"] for i in range(24)], 1).reshape(20, 3, 8).swapaxes(1, 2)
     assert np.abs(rest - np.clip(expected, -1, 127 / 128)).max() <= 0.5 / 128 + 1e-6
+
+
+@pytest.mark.parametrize(("farthest", "fraction"), [(1e-3, 24), (0.9, 23), (18.4, 18), (2047.9, 12), (0.0, 24)])
+def test_an_spz_has_its_places_in_as_many_bits_as_fit(tmp_path, farthest, fraction):
+    """Steps of 1/4096 unit moved the smallest splats of a capture by more than their size, and cost up to 2 dB."""
+    columns = columns_of(20, degree=0)
+    for axis in "xyz":
+        columns[axis] *= np.float32(farthest) / np.abs(columns[axis]).max()
+    (tmp_path / "a.spz").write_bytes(spz_of(columns, 0))
+    refine(tmp_path / "a.spz", columns)
+    written = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    assert written[:16] == struct.pack("<4sIIBBBB", b"NGSP", 3, 20, 0, fraction, 1, 0) and written[16 + 9 * 20 :] == bytes(range(11)) * 20
+    low, middle, high = np.frombuffer(written[16 : 16 + 9 * 20], np.uint8).reshape(20, 3, 3).astype(int).transpose(2, 0, 1)
+    codes = low + 256 * middle + 65536 * np.where(high < 128, high, high - 256)
+    assert np.abs(codes / 2**fraction - np.stack([columns[axis] for axis in "xyz"], 1)).max() <= 0.5 / 2**fraction
+
+
+def test_an_spz_of_another_version_stays_as_it_is(tmp_path):
+    columns = columns_of(20, degree=1)
+    (tmp_path / "a.spz").write_bytes(before := spz_of(columns, 1, version=2))
+    refine(tmp_path / "a.spz", columns)
+    assert (tmp_path / "a.spz").read_bytes() == before
 
 
 def test_saving_writes_so(tmp_path, tool):

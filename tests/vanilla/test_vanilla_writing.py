@@ -107,6 +107,15 @@ def test_cfg_args_follow_the_sh_degree_of_the_ply(tmp_path):
     assert (options["sh_degree"], options["resolution"], options["white_background"]) == (3, 4, True)
 
 
+@pytest.mark.parametrize(("options", "held_out"), [(None, None), ("Namespace(eval=True)", True), ("Namespace(eval=False)", False)])
+def test_whether_views_were_held_out_is_as_unknown_as_before(tmp_path, options, held_out):
+    """The original asks for the option; None is no --eval to it, and unknown here: a False would say that the base was trained on all views."""
+    folder = write_model_folder(tmp_path / "m")
+    (folder / "cfg_args").write_text(options) if options else (folder / "cfg_args").unlink()
+    load_vanilla(folder).save(tmp_path / "out", provenance={})
+    assert read_cfg_args(tmp_path / "out/cfg_args")["eval"] is held_out
+
+
 @pytest.mark.parametrize("iteration", [None, 0])
 def test_folder_of_a_model_without_an_iteration(tmp_path, iteration):
     model = raw_model() if iteration is None else load_vanilla(write_model_folder(tmp_path / "m", iteration))

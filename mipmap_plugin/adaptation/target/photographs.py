@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.target.resize import resize
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.errors import SettingsError, type_of
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.base import Placed, SplatModel
@@ -24,6 +24,9 @@ from mipmap_plugin.scenes.base import SHAPE_TOLERANCE, SPLIT
 
 # Cameras are in a world if they are nearer to its cameras than to those of the other by this factor: in neither, one is nearer by chance.
 FAR_NEARER = 0.1
+
+# Cameras that tell in which world all of them are.
+LOOKED_AT = 256
 
 
 class Photographs:
@@ -70,10 +73,11 @@ def at_density_of(cameras: Sequence[Camera], base: Sequence[Camera]) -> list[Cam
     kinds, named = {(*view.size, view.fx, view.fy): view for view in base}, defaultdict[str, list[Camera]](list)
     for view in base:
         named[Path(view.name).stem].append(view)  # several, where images of several folders have the same names
+    similar, similar_of_name = MostSimilar(list(kinds.values())), {name: MostSimilar(views) for name, views in named.items()}
 
     def at_density(camera: Camera) -> Camera:
         own = named.get(Path(camera.name).stem, [])
-        view = min(own or kinds.values(), key=lambda view: _difference(view, camera))
+        view = similar_of_name.get(Path(camera.name).stem, similar)(camera)
         ratio = view.fx / camera.fx
         resized = camera.resized(max(1, round(camera.width * ratio)), max(1, round(camera.height * ratio)))
         if camera.index is None and len(own) == 1 and view.split == camera.split:
@@ -88,10 +92,23 @@ def _is_centered(camera: Camera) -> bool:
     return math.isclose(2 * camera.cx, camera.width) and math.isclose(2 * camera.cy, camera.height)
 
 
-def _difference(one: Camera, other: Camera) -> float:
-    """How much the fields of view of two cameras differ along both axes: the sum of the logarithms of their ratios."""
-    ratios = one.width / one.fx * other.fx / other.width, one.height / one.fy * other.fy / other.height
-    return sum(abs(math.log(ratio)) for ratio in ratios)
+class MostSimilar:
+    """Finds among views the one whose field of view differs least along both axes: by the sum of the logarithms of its ratios.
+
+    It compares with all at once, for each of 10,000 cameras may have a lens of its own.
+    """
+
+    def __init__(self, views: Sequence[Camera]) -> None:
+        self._views = views
+        self._fields = torch.tensor([_field(view) for view in views], dtype=torch.float64)
+
+    def __call__(self, camera: Camera) -> Camera:
+        return self._views[int((self._fields - self._fields.new_tensor(_field(camera))).abs().sum(1).argmin())]
+
+
+def _field(camera: Camera) -> tuple[float, float]:
+    """The field of view along both axes, by the logarithm of the picture's size in focal lengths."""
+    return math.log(camera.width / camera.fx), math.log(camera.height / camera.fy)
 
 
 def scene_of(model: SplatModel, images: Scene | str | Path) -> Scene:
@@ -134,6 +151,11 @@ def _unapplied(scene: Scene, cameras: Sequence[Camera]) -> Scene:
 
 def _apart(scene: Scene, cameras: Sequence[Camera]) -> float:
     """How far cameras of a scene and of a base are from the nearest of the other, median, in world units; one may have but some of the other's."""
-    there, here = (torch.stack([camera.center for camera in each]) for each in (scene.cameras, cameras))
-    distances = torch.cdist(there, here, compute_mode="donot_use_mm_for_euclid_dist")
-    return min(float(distances.amin(axis).median()) for axis in (0, 1))
+    pairs = (scene.cameras, cameras), (cameras, scene.cameras)
+    return min(_to_nearest(evenly(some, LOOKED_AT), others) for some, others in pairs)
+
+
+def _to_nearest(some: Sequence[Camera], others: Sequence[Camera]) -> float:
+    """How far `some` cameras are from the nearest of the `others`, median, in world units."""
+    these, those = (torch.stack([camera.center for camera in each]) for each in (some, others))
+    return float(torch.cdist(these, those, compute_mode="donot_use_mm_for_euclid_dist").amin(1).median())

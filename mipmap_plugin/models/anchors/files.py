@@ -143,10 +143,13 @@ def refuse_others(ply: Path, companions: Mapping[str, bytes], source: Path | Non
 
 
 def cfg_text(source: Path | None, target: Path, trained: TrainedScale, options: dict[str, Any]) -> str:
-    """The source's own cfg_args; if there is none, the original's usual options and those that follow from the files."""
+    """The source's own cfg_args; if there is none, the original's usual options and those that follow from the files.
+
+    Whether views were held out (`eval`) is None then: not known.
+    """
     if source is not None and (source / "cfg_args").is_file():
         return (source / "cfg_args").read_bytes().decode("utf-8")
-    usual = {"source_path": "", "model_path": str(target), "images": "images", "resolution": trained.resolution, "data_device": "cuda", "eval": False}
+    usual = {"source_path": "", "model_path": str(target), "images": "images", "resolution": trained.resolution, "data_device": "cuda", "eval": None}
     sampling = {"ds": 1, "ratio": 1, "undistorted": False, "white_background": trained.background == (1.0, 1.0, 1.0)}
     return format_cfg_args({**usual, **sampling, **options})
 
