@@ -15,6 +15,9 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import Packing
 from mipmap_plugin.splatting.harmonics import C0
 
+# The least color of degree 0, invisible: exactly black is on either side of 0 once its coefficient is rounded to float32, and below 0 it had no gradient.
+LEAST_COLOR = 1e-6
+
 # Sine of half the angle below which a rotation's axis is undefined.
 LEAST_TURN = 1e-6
 
@@ -90,7 +93,8 @@ def _harmonics(sh: Tensor, packing: Packing) -> Tensor:
     """Quantize [N, K, 3]: the color of degree 0 within 0..1, higher coefficients within -1..1, each to multiples of its step."""
     parts = [sh[:, :1]]
     if packing.color is not None:
-        parts = [(_stepped((C0 * sh[:, :1] + 0.5).clamp(0, 1), packing.color, packing.downwards) - 0.5) / C0]
+        stepped = _stepped((C0 * sh[:, :1] + 0.5).clamp(0, 1), packing.color, packing.downwards)
+        parts = [(stepped.clamp_min(LEAST_COLOR) - 0.5) / C0]
     for degree in range(1, math.isqrt(sh.shape[1])):
         band = sh[:, degree**2 : (degree + 1) ** 2]
         parts.append(_stepped(band.clamp(-1, 1), packing.bands[degree - 1]) if degree <= len(packing.bands) else band)
