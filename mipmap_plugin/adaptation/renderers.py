@@ -106,5 +106,12 @@ def _shots(cameras: Sequence[Camera], targets: Sequence[Effects], draw: int) -> 
 
 
 def unrounded(effects: Effects) -> Effects:
-    """The effects without the rounding of a viewer's file and picture, which is noise to an optimizer step and a third of its time."""
-    return replace(effects, settings=replace(effects.settings, packing=None, picture_step=None))
+    """The effects without the rounding of a viewer's file and picture, which is noise to an optimizer step and a third of its time.
+
+    The limits of a file's colors stay where these are all that is drawn: steps must not count on colors that the file cannot hold.
+    """
+    settings = effects.settings
+    limited = settings.packing is not None and settings.packing.color is not None and effects.sh_degree == 0
+    if limited and settings.max_color is None and settings.color_steps is None:
+        settings = replace(settings, max_color=1.0)
+    return replace(effects, settings=replace(settings, packing=None, picture_step=None))

@@ -6,7 +6,7 @@ import pytest
 import torch
 from one_splat import BOTH, C0, MIDDLE, camera, differentiable, splat
 
-from mipmap_plugin.adaptation.renderers import SteppingRenderer
+from mipmap_plugin.adaptation.renderers import SteppingRenderer, unrounded
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
@@ -36,6 +36,25 @@ def test_a_color_in_steps_keeps_its_gradient(backend):
     rendered = backend.render(splats, camera(), effects)
     rendered.image[MIDDLE, MIDDLE, 0].backward()
     assert leaves["sh"].grad[0, 0, 0] == pytest.approx(C0 * rendered.alpha[MIDDLE, MIDDLE].item(), rel=1e-4)
+
+
+@BOTH
+@pytest.mark.parametrize("color", [0.2 / 255, -0.3])
+def test_a_color_packed_as_black_keeps_its_gradient(backend, color):
+    leaves, splats = differentiable(splat(40.0, 40.0, 1.0, color))
+    rendered = backend.render(splats, camera(), find_viewer("antimatter15").effects(Effects(0)))
+    rendered.image[MIDDLE, MIDDLE, 0].backward()
+    assert rendered.image[MIDDLE, MIDDLE, 0] == 0
+    assert leaves["sh"].grad[0, 0, 0] == pytest.approx(C0 * rendered.alpha[MIDDLE, MIDDLE].item(), rel=1e-4)
+
+
+@BOTH
+@pytest.mark.parametrize("viewer", ["antimatter15", "gaussian-splats-3d", "babylon", "cesium", "spark", "playcanvas"])
+def test_steps_see_colors_as_bright_as_the_viewer_shows_them(backend, viewer):
+    """Of a scene without view-dependent color."""
+    effects = find_viewer(viewer).effects(Effects(0))
+    shown, seen = (backend.render(splat(40.0, 40.0, 0.5, 1.7), camera(), each).image.max().item() for each in (effects, unrounded(effects)))
+    assert seen == pytest.approx(shown, abs=4 / 255)
 
 
 @BOTH
