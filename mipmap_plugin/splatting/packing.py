@@ -15,7 +15,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import Packing
 from mipmap_plugin.splatting.harmonics import C0
 
-# The least color of degree 0, invisible: exactly black is on either side of 0 once its coefficient is rounded to float32, and below 0 it had no gradient.
+# The least color of degree 0, which looks black. At 0 the rounding of its coefficient to float32 would decide whether it has a gradient.
 LEAST_COLOR = 1e-6
 
 # Sine of half the angle below which a rotation's axis is undefined.
