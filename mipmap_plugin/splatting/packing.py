@@ -18,6 +18,9 @@ from mipmap_plugin.splatting.harmonics import C0
 # The least color of degree 0, which looks black. At 0 the rounding of its coefficient to float32 would decide whether it has a gradient.
 LEAST_COLOR = 1e-6
 
+# The coefficients of SH degree 0 of black and of the brightest color.
+COLOR_LIMITS = (LEAST_COLOR - 0.5) / C0, 0.5 / C0
+
 # Sine of half the angle below which a rotation's axis is undefined.
 LEAST_TURN = 1e-6
 
@@ -94,7 +97,7 @@ def _harmonics(sh: Tensor, packing: Packing) -> Tensor:
     parts = [sh[:, :1]]
     if packing.color is not None:
         stepped = _stepped((C0 * sh[:, :1] + 0.5).clamp(0, 1), packing.color, packing.downwards)
-        parts = [(stepped.clamp_min(LEAST_COLOR) - 0.5) / C0]
+        parts = [((stepped - 0.5) / C0).clamp(*COLOR_LIMITS)]
     for degree in range(1, math.isqrt(sh.shape[1])):
         band = sh[:, degree**2 : (degree + 1) ** 2]
         parts.append(_stepped(band.clamp(-1, 1), packing.bands[degree - 1]) if degree <= len(packing.bands) else band)

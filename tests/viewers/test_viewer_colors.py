@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+import tiny
 import torch
 from one_splat import BOTH, C0, MIDDLE, camera, differentiable, splat
 
@@ -10,8 +11,10 @@ from mipmap_plugin.adaptation.renderers import SteppingRenderer, unrounded
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.splatting.viewers import find_viewer
+from mipmap_plugin.wrap import wrap_model
 
 
 @BOTH
@@ -55,6 +58,17 @@ def test_steps_see_colors_as_bright_as_the_viewer_shows_them(backend, viewer):
     effects = find_viewer(viewer).effects(Effects(0))
     shown, seen = (backend.render(splat(40.0, 40.0, 0.5, 1.7), camera(), each).image.max().item() for each in (effects, unrounded(effects)))
     assert seen == pytest.approx(shown, abs=4 / 255)
+
+
+@pytest.mark.parametrize(("viewer", "limited"), [("cesium", True), ("playcanvas", False)])
+@BOTH
+def test_steps_leave_colors_within_those_that_the_file_holds(backend, viewer, limited):
+    splats = tiny.gaussians(20)
+    splats.sh[:, 0] *= 4
+    base = wrap_model(VanillaModel.from_gaussians(splats), cameras=tiny.cameras(2, width=8, height=6), backend=backend.name)
+    adapted = base.adapt(1 / 2, viewer=viewer, steps=2, views="given", returns="last").model.gaussians()
+    color = 0.5 + C0 * adapted.sh[:, 0].detach()
+    assert (color.max().item() <= 1 + 1e-6) == limited
 
 
 @BOTH

@@ -142,7 +142,7 @@ def _step_by_rows(run: Run, rows: ByRows, task: Task, config: AdaptConfig, views
 
     square_errors = rows.differentiate([task.cameras[view] for view in views], run.step * config.views_per_step, compare)
     run.square_error = run.square_error + torch.stack(square_errors).mean()
-    rows.step(run.optimizer)
+    rows.step(run.optimizer, task.color_limits)
 
 
 # --8<-- [end:step]
@@ -170,6 +170,8 @@ def _step_by_autograd(run: Run, task: Task, config: AdaptConfig, views: Sequence
         splats.backward()
         run.optimizer.step()
     run.optimizer.zero_grad()
+    if task.color_limits is not None and (colors := run.student.parameters().get("sh0")) is not None:
+        colors.detach().clamp_(*task.color_limits)
 
 
 def _compare_all(
