@@ -178,6 +178,8 @@ def _compare_all(
     task: Task, config: AdaptConfig, views: Sequence[Camera], images: Sequence[Tensor], targets: Sequence[Tensor]
 ) -> list[tuple[Tensor, Tensor]]:
     """`_compare` of several views: in one operation where their images are of one size, since a GPU waits for each."""
+    if task.scale > 1 and config.compare_at == "base":  # a display shows white at most: what is brighter would outweigh all else
+        images = [image.detach().clamp_max(1) for image in images]
     if len(images) == 1 or task.detail is not None or len({image.shape for image in (*images, *targets)}) > 1:
         return [_compare(task, config, *each) for each in zip(views, images, targets, strict=True)]
     gradients, square_errors = gradient_of(torch.stack(list(images)).detach() - torch.stack(list(targets)), config.loss)
