@@ -15,11 +15,9 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import Packing
 from mipmap_plugin.splatting.harmonics import C0
 
-# The least color of degree 0, which looks black. At 0 the rounding of its coefficient to float32 would decide whether it has a gradient.
-LEAST_COLOR = 1e-6
-
-# The coefficients of SH degree 0 of black and of the brightest color.
-COLOR_LIMITS = (LEAST_COLOR - 0.5) / C0, 0.5 / C0
+# The coefficients of SH degree 0 of black and of white, or what looks so: at exactly 0 and 1, where colors are clamped, the rounding of the
+# coefficient to float32 would decide whether it has a gradient.
+COLOR_LIMITS = (1e-6 - 0.5) / C0, (0.5 - 1e-6) / C0
 
 # Sine of half the angle below which a rotation's axis is undefined.
 LEAST_TURN = 1e-6
