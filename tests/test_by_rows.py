@@ -65,6 +65,16 @@ def step_by_rows(model, optimizer, shots=SHOTS):
     rows.step(optimizer)
 
 
+def test_a_step_leaves_colors_within_limits_and_is_followed_by_one_of_the_same_stepper():
+    model = student()
+    rows = of(model)
+    differentiate(rows)
+    rows.step(make_optimizer(model, recipe("default", 1 / 4), pixel=0.1), (-0.1, 0.1))
+    colors = model.parameters()["sh0"].detach()
+    assert colors.abs().max() == pytest.approx(0.1) and of(model, rows) is rows
+    torch.testing.assert_close(draw(rows)[0], BACKEND.render(model.gaussians().detach(), *SHOTS[0]).image)
+
+
 def after(steps, **options) -> dict[str, torch.Tensor]:
     """The parameters and moments after some steps."""
     model = student(**options)

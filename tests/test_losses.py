@@ -1,9 +1,12 @@
 """The gradients of losses, against autograd's of their definitions."""
 
 import pytest
+import tiny
 import torch
 
 from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR, gradient_of
+from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.wrap import wrap_model
 
 DEFINITIONS = {
     "l1": lambda difference: difference.abs().mean(),
@@ -34,3 +37,12 @@ def test_those_of_several_images_are_those_of_each(loss):
 def test_an_image_that_is_right_has_no_gradient():
     gradient, square_error = gradient_of(torch.zeros(2, 2, 3), "psnr")
     assert not gradient.any() and square_error == 0
+
+
+def test_steps_of_a_zoom_in_leave_what_a_display_cannot_show():
+    """Colors up to twenty times white: steps that make all of it white do nothing for the rest."""
+    splats = tiny.gaussians(60)
+    splats.sh.mul_(30)
+    base = wrap_model(VanillaModel.from_gaussians(splats), cameras=tiny.cameras(2, width=16, height=12), backend="reference")
+    psnrs = base.adapt(2, steps=20, views="given", check_every=20).report.validation
+    assert psnrs["the last state"] > psnrs["the start, the closed form"] + 0.5

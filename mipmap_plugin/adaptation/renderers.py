@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar
@@ -18,7 +18,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.process import threads
 from mipmap_plugin.process.threads import side_by_side
-from mipmap_plugin.splatting.packing import in_two_steps, packed
+from mipmap_plugin.splatting.packing import COLOR_LIMITS, in_two_steps, packed
 
 # The numbers of views in a step and their images [h, w, 3] -> the gradient of each one's loss, [h, w, 3], and its mean square error, [].
 Comparison = Callable[[Sequence[int], Sequence[Tensor]], list[tuple[Tensor, Tensor]]]
@@ -105,6 +105,19 @@ def _shots(cameras: Sequence[Camera], targets: Sequence[Effects], draw: int) -> 
     return [(camera, targets[(draw + number) % len(targets)]) for number, camera in enumerate(cameras)]
 
 
+def color_limits(targets: Iterable[Effects]) -> tuple[float, float] | None:
+    """The least and the greatest coefficient of SH degree 0 that a file holds for each of these viewers; None if one of them limits none."""
+    packings = [target.settings.packing for target in targets]
+    return COLOR_LIMITS if all(packing is not None and packing.color is not None for packing in packings) else None
+
+
 def unrounded(effects: Effects) -> Effects:
-    """The effects without the rounding of a viewer's file and picture, which is noise to an optimizer step and a third of its time."""
-    return replace(effects, settings=replace(effects.settings, packing=None, picture_step=None))
+    """The effects without the rounding of a viewer's file and picture, which is noise to an optimizer step and a third of its time.
+
+    The limits of a file's colors stay where these are all that is drawn: steps must not count on colors that the file cannot hold.
+    """
+    settings = effects.settings
+    limited = settings.packing is not None and settings.packing.color is not None and effects.sh_degree == 0
+    if limited and settings.max_color is None and settings.color_steps is None:
+        settings = replace(settings, max_color=1.0)
+    return replace(effects, settings=replace(settings, packing=None, picture_step=None))

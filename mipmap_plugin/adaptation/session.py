@@ -24,7 +24,7 @@ from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Quality, Validation, split_validation
-from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, unrounded, views_renderer
+from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, color_limits, unrounded, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, simulated, versions
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer, ends_run
 from mipmap_plugin.adaptation.shown import refuse_blind, remarks, showing, too_unlike
@@ -178,8 +178,8 @@ class Session:
         return Task(
             self.views, self.scale, self.truth, renders, self.effects.background == (1.0, 1.0, 1.0), self.validation, self.detail,
             max_splats=self._most_splats if growth is None else min(self._most_splats, int(growth * len(student.parameters()["means"]))),
-            render_views=views_renderer(self.backend, targets), render_to_step=SteppingRenderer.of(self.backend, targets),
-            follow=Following(self.base, self.views, self.scale),
+            render_views=views_renderer(self.backend, targets), color_limits=color_limits(self.extremes.values()),
+            render_to_step=SteppingRenderer.of(self.backend, targets), follow=Following(self.base, self.views, self.scale),
         )  # fmt: skip
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:

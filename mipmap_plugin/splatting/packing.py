@@ -15,6 +15,10 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import Packing
 from mipmap_plugin.splatting.harmonics import C0
 
+# The coefficients of SH degree 0 of black and of white, or what looks so: at exactly 0 and 1, where colors are clamped, the rounding of the
+# coefficient to float32 would decide whether it has a gradient.
+COLOR_LIMITS = (1e-6 - 0.5) / C0, (0.5 - 1e-6) / C0
+
 # Sine of half the angle below which a rotation's axis is undefined.
 LEAST_TURN = 1e-6
 
@@ -90,7 +94,8 @@ def _harmonics(sh: Tensor, packing: Packing) -> Tensor:
     """Quantize [N, K, 3]: the color of degree 0 within 0..1, higher coefficients within -1..1, each to multiples of its step."""
     parts = [sh[:, :1]]
     if packing.color is not None:
-        parts = [(_stepped((C0 * sh[:, :1] + 0.5).clamp(0, 1), packing.color, packing.downwards) - 0.5) / C0]
+        stepped = _stepped((C0 * sh[:, :1] + 0.5).clamp(0, 1), packing.color, packing.downwards)
+        parts = [((stepped - 0.5) / C0).clamp(*COLOR_LIMITS)]
     for degree in range(1, math.isqrt(sh.shape[1])):
         band = sh[:, degree**2 : (degree + 1) ** 2]
         parts.append(_stepped(band.clamp(-1, 1), packing.bands[degree - 1]) if degree <= len(packing.bands) else band)

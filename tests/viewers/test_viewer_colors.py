@@ -3,15 +3,18 @@
 from dataclasses import replace
 
 import pytest
+import tiny
 import torch
 from one_splat import BOTH, C0, MIDDLE, camera, differentiable, splat
 
-from mipmap_plugin.adaptation.renderers import SteppingRenderer
+from mipmap_plugin.adaptation.renderers import SteppingRenderer, unrounded
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.splatting.viewers import find_viewer
+from mipmap_plugin.wrap import wrap_model
 
 
 @BOTH
@@ -36,6 +39,36 @@ def test_a_color_in_steps_keeps_its_gradient(backend):
     rendered = backend.render(splats, camera(), effects)
     rendered.image[MIDDLE, MIDDLE, 0].backward()
     assert leaves["sh"].grad[0, 0, 0] == pytest.approx(C0 * rendered.alpha[MIDDLE, MIDDLE].item(), rel=1e-4)
+
+
+@BOTH
+@pytest.mark.parametrize(("viewer", "color"), [("antimatter15", 0.2 / 255), ("antimatter15", -0.3), ("spark", 254.9 / 255), ("babylon", 1.2)])
+def test_a_color_packed_as_black_or_white_keeps_its_gradient(backend, viewer, color):
+    leaves, splats = differentiable(splat(40.0, 40.0, 1.0, color))
+    rendered = backend.render(splats, camera(), find_viewer(viewer).effects(Effects(0)))
+    rendered.image[MIDDLE, MIDDLE, 0].backward()
+    assert rendered.image[MIDDLE, MIDDLE, 0].item() == pytest.approx(round(color), abs=1.1 / 255)
+    assert leaves["sh"].grad[0, 0, 0] == pytest.approx(C0 * rendered.alpha[MIDDLE, MIDDLE].item(), rel=1e-4)
+
+
+@BOTH
+@pytest.mark.parametrize("viewer", ["antimatter15", "gaussian-splats-3d", "babylon", "cesium", "spark", "playcanvas"])
+def test_steps_see_colors_as_bright_as_the_viewer_shows_them(backend, viewer):
+    """Of a scene without view-dependent color."""
+    effects = find_viewer(viewer).effects(Effects(0))
+    shown, seen = (backend.render(splat(40.0, 40.0, 0.5, 1.7), camera(), each).image.max().item() for each in (effects, unrounded(effects)))
+    assert seen == pytest.approx(shown, abs=4 / 255)
+
+
+@pytest.mark.parametrize(("viewer", "limited"), [("cesium", True), ("playcanvas", False)])
+@BOTH
+def test_steps_leave_colors_within_those_that_the_file_holds(backend, viewer, limited):
+    splats = tiny.gaussians(20)
+    splats.sh[:, 0] *= 4
+    base = wrap_model(VanillaModel.from_gaussians(splats), cameras=tiny.cameras(2, width=8, height=6), backend=backend.name)
+    adapted = base.adapt(1 / 2, viewer=viewer, steps=2, views="given", returns="last").model.gaussians()
+    color = 0.5 + C0 * adapted.sh[:, 0].detach()
+    assert (color.max().item() <= 1 + 1e-6) == limited
 
 
 @BOTH

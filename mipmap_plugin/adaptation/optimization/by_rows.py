@@ -51,11 +51,14 @@ class ByRows:
         """Draw the views of a step, whose first is the `draw`-th since the beginning, and compare their images; return the mean square errors."""
         return self.draw.differentiate(self.stepper, cameras, draw, compare)
 
-    def step(self, optimizer: Adam) -> None:
-        """Move the parameters, once some views are differentiated."""
+    def step(self, optimizer: Adam, color_limits: tuple[float, float] | None = None) -> None:
+        """Move the parameters, once some views are differentiated. color_limits: as of `Task`."""
         if self.moments is None or not self.moments.are_of(optimizer):
             self.moments = _Moments.of(optimizer, self.parameters)
         self.stepper.step(self.moments.next_step(optimizer, self.raw))
+        if color_limits is not None:
+            self.raw["sh"][:, 0].clamp_(*color_limits)
+            self.versions = _versions(self.parameters)
 
 
 def _versions(parameters: Mapping[str, Tensor]) -> tuple[int, ...]:

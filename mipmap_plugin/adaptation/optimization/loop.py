@@ -147,7 +147,7 @@ def _step_by_rows(run: Run, rows: ByRows, task: Task, config: AdaptConfig, views
 
     square_errors = rows.differentiate([task.cameras[view] for view in views], run.step * config.views_per_step, compare)
     run.square_error = run.square_error + torch.stack(square_errors).mean()
-    rows.step(run.optimizer)
+    rows.step(run.optimizer, task.color_limits)
 
 
 # --8<-- [end:step]
@@ -175,12 +175,16 @@ def _step_by_autograd(run: Run, task: Task, config: AdaptConfig, views: Sequence
         splats.backward()
         run.optimizer.step()
     run.optimizer.zero_grad()
+    if task.color_limits is not None and (colors := run.student.parameters().get("sh0")) is not None:
+        colors.detach().clamp_(*task.color_limits)
 
 
 def _compare_all(
     task: Task, config: AdaptConfig, views: Sequence[Camera], images: Sequence[Tensor], targets: Sequence[Tensor]
 ) -> list[tuple[Tensor, Tensor]]:
     """`_compare` of several views: in one operation where their images are of one size, since a GPU waits for each."""
+    if task.scale > 1 and config.compare_at == "base":  # a display shows white at most: what is brighter would outweigh all else
+        images = [image.detach().clamp_max(1) for image in images]
     if len(images) == 1 or task.detail is not None or len({image.shape for image in (*images, *targets)}) > 1:
         return [_compare(task, config, *each) for each in zip(views, images, targets, strict=True)]
     gradients, square_errors = gradient_of(torch.stack(list(images)).detach() - torch.stack(list(targets)), config.loss)

@@ -47,6 +47,7 @@ class Task:
     render_views: ViewsRenderer | None = None  # the same in one call, if the backend can
     render_to_step: SteppingRenderer | None = None  # the same if the backend can move the splats itself
     follow: Following = field(default_factory=Following)  # called before each step
+    color_limits: tuple[float, float] | None = None  # of the coefficients of SH degree 0, which a step leaves within them
     part: str = ""  # of a scene, such as a tile or a level by distance, whose views are of another scale
 
     @cached_property
