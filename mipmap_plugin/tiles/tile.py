@@ -15,6 +15,7 @@ from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.adaptation.optimization.validation import Steering, no_validation
+from mipmap_plugin.adaptation.renderers import color_limits
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.tiles.folder import run_file, start_file, tile_file
 from mipmap_plugin.tiles.scene import TiledScene
@@ -92,7 +93,7 @@ class Tile:
         most = sys.maxsize if growth is None else int(growth * len(Store(start)))
         return Task(
             views, 1.0, around.wanted, [around.render], white, validation, max_splats=most, render_views=around.render_views,
-            render_to_step=around.to_step, part=f"tile {self.number + 1} x{self.scene.scale:g}",
+            render_to_step=around.to_step, color_limits=color_limits([self.scene.target]), part=f"tile {self.number + 1} x{self.scene.scale:g}",
         )  # fmt: skip
 
     def _fingerprint(self) -> str:

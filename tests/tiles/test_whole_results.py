@@ -7,6 +7,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import tiny
 from cut_scenes import base_pictures
@@ -14,10 +15,13 @@ from cut_scenes import base_pictures
 from mipmap_plugin.adaptation.optimization import loop
 from mipmap_plugin.cli import main
 from mipmap_plugin.formats.ply import read_header, read_ply
+from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.mip import MipModel
 from mipmap_plugin.models.reading import load_vanilla
+from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.splatting.packing import COLOR_LIMITS
 from mipmap_plugin.tiles import plan, run
 from mipmap_plugin.tiles.reading import make_cut
 from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
@@ -59,6 +63,14 @@ def test_a_file_for_a_filter_that_the_tag_does_not_tell_whole_is_read_back_with_
         made = load_model(adapt_in_tiles(replace(asked, settings=job.settings | {"steps": 0}), 2).file)
         assert (made.trained.screen_filter, made.trained.eps2d) == ("mip", 0.1)
         assert isinstance(made, MipModel) == (asked.viewer == "mip")  # whose loader requires filter_3D
+
+
+def test_tiles_stay_within_the_colors_that_a_viewers_file_holds(job):
+    bright = tiny.gaussians(80)
+    bright.sh[:, 0] += 1
+    base = Base(VanillaModel.from_gaussians(bright).save(job.target.with_name("bright.ply"), provenance={}), job.base.checkpoint / "cameras.json")
+    made = load_vanilla(adapt_in_tiles(replace(job, base=base, viewer="spark"), 2).file)
+    assert made.parameters()["sh0"].max() <= np.float32(COLOR_LIMITS[1])
 
 
 def test_a_model_folder_is_written_as_one(job, tmp_path):
