@@ -146,6 +146,15 @@ def test_a_file_for_a_viewer_is_read_back_with_its_dilation(tmp_path, viewer, wr
     assert (trained.screen_filter, trained.eps2d) == ("mip", base.effects(viewer=viewer).eps2d)
 
 
+@pytest.mark.parametrize("target", ["out", "out.pt"])
+def test_a_file_of_its_own_format_keeps_all_bands_and_is_not_said_to_lack_some(tmp_path, target):
+    """A loader of PLYs does not read it, whatever bands it has."""
+    raw = tiny.model(40).with_degree(4).parameters()
+    adapted = wrap_model(gsplat_folder(tmp_path / "r", raw), cameras=tiny.cameras()).adapt(1 / 4, viewer="spark", recipe="instant")
+    file = adapted.save(tmp_path / target)
+    assert load_model(file).parameters()["shN"].shape[1] == 24 and not any("left out" in note for note in adapted.report_of(file).notes)
+
+
 def test_a_ply_is_written_on_request(tmp_path):
     raw = splats()
     saved = load_model(gsplat_folder(tmp_path / "r", raw)).save(tmp_path / "out.ply", provenance={})

@@ -35,7 +35,6 @@ from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.plugin_errors import naming_any, unchanged
 from mipmap_plugin.process.torch_modes import in_usual_modes, usual_modes
 from mipmap_plugin.progress import announced
-from mipmap_plugin.splatting.viewers import degree_for, reads_extra_columns
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -140,14 +139,15 @@ class Adapted:
         return self.report.model_copy(update=changes | self.written.get(path, {}))
 
     def _unread(self, path: Path) -> str:
-        """What the PLY at `path` is without, for the loader of its viewer does not read it, in a sentence; "" if it has everything."""
+        """What the file at `path` is without, for the loader of its viewer does not read it, in a sentence; "" if it has everything."""
         if is_written(path):
             return ""
-        viewer, degree, extras = self.report.viewer, getattr(self.model, "sh_degree", 0), ", ".join(getattr(self.model, "extras", ()))
-        read = degree_for(viewer, degree)
+        written = for_loader_of(self.report.viewer, self.model, path)
+        degree, read = (getattr(model, "sh_degree", 0) for model in (self.model, written))
+        extras = ", ".join(name for name in getattr(self.model, "extras", ()) if name not in getattr(written, "extras", ()))
         lost = [f"SH bands above degree {read}"] if read < degree else []
-        lost += [f"the extra columns {extras}"] if extras and not reads_extra_columns(viewer) else []
-        return f"{' and '.join(lost)} are left out, which loaders of {viewer} do not read right" if lost else ""
+        lost += [f"the extra columns {extras}"] if extras else []
+        return f"{' and '.join(lost)} are left out, which loaders of {self.report.viewer} do not read right" if lost else ""
 
     def _rounded(self, path: Path) -> str:
         """What the rounding of its format costs the file at `path`, in a sentence; "" where that is hardly anything, or was not measured."""
