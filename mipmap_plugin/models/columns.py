@@ -19,9 +19,6 @@ SH_DEGREES = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
 # Opacities keep this distance from 0 and 1, whose logits are infinite: far below one step of 8 bits, yet resolved by float32.
 OPACITY_MARGIN = 1e-6
 
-# Floats above this are no colors in 0..1, even of lights.
-BRIGHTEST = 16
-
 # Floats above this are no colors in 0..1, not even of lights.
 BRIGHTEST = 16
 
