@@ -29,7 +29,7 @@ from mipmap_plugin.limits import check_image, path_of
 from mipmap_plugin.models import contract, load_model
 from mipmap_plugin.models.base import SplatModel, checked_splats, effects_of, tensors_of
 from mipmap_plugin.models.exposure import exposed
-from mipmap_plugin.models.mip import for_loader_of
+from mipmap_plugin.models.mip import for_loader_of, unread
 from mipmap_plugin.models.outputs import drawn_otherwise, parts_of, without_place
 from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.plugin_errors import naming_any, unchanged
@@ -107,7 +107,7 @@ class Adapted:
             write_json(saved.with_name(saved.name + REPORT), self.report_of(saved).model_dump(), overwrite=overwrite)
         for state in self.states:
             state.remove()
-        for said in filter(None, (self._unread(saved), self._rounded(saved), self._drawn_otherwise(saved))):
+        for said in filter(None, (unread(self.report.viewer, self.model, saved), self._rounded(saved), self._drawn_otherwise(saved))):
             warn(said)
         return saved
 
@@ -132,22 +132,11 @@ class Adapted:
     def report_of(self, path: Path) -> Report:
         """The report of the file at `path`, which also says what its format rounds, what it has no place for, and who draws it otherwise."""
         left_out = without_place(path, getattr(self.model, "extras", ()), getattr(self.model, "sh_degree", 0))
-        lost = filter(None, (left_out, self._unread(path), self._rounded(path), self._drawn_otherwise(path)))
+        lost = filter(None, (left_out, unread(self.report.viewer, self.model, path), self._rounded(path), self._drawn_otherwise(path)))
         moved = self.model.traits.placed and (path.suffix.lower() == ".ply" or is_written(path))  # which does not say where the cameras go
         cameras_from = {} if moved else self.report.cameras_from
         changes = {"notes": [*self.report.notes, *lost], "cameras_from": cameras_from, "written": None}
         return self.report.model_copy(update=changes | self.written.get(path, {}))
-
-    def _unread(self, path: Path) -> str:
-        """What the file at `path` is without, for the loader of its viewer does not read it, in a sentence; "" if it has everything."""
-        if is_written(path):
-            return ""
-        written = for_loader_of(self.report.viewer, self.model, path)
-        degree, read = (getattr(model, "sh_degree", 0) for model in (self.model, written))
-        extras = ", ".join(name for name in getattr(self.model, "extras", ()) if name not in getattr(written, "extras", ()))
-        lost = [f"SH bands above degree {read}"] if read < degree else []
-        lost += [f"the extra columns {extras}"] if extras else []
-        return f"{' and '.join(lost)} are left out, which loaders of {self.report.viewer} do not read right" if lost else ""
 
     def _rounded(self, path: Path) -> str:
         """What the rounding of its format costs the file at `path`, in a sentence; "" where that is hardly anything, or was not measured."""

@@ -184,6 +184,15 @@ def for_loader_of(viewer: str | None, model: SplatModel, path: Path) -> SplatMod
     return model.with_extras({**model.extras, COLUMN: np.zeros(len(model), dtype=np.float32)}) if wants_filter(viewer) else model
 
 
+def unread(viewer: str | None, model: SplatModel, path: Path) -> str:
+    """What the file at `path` is without, for the loader of the viewer does not read it, in a sentence; "" if it has everything."""
+    written = for_loader_of(viewer, model, path)
+    degree, read = (getattr(each, "sh_degree", 0) for each in (model, written))
+    extras = ", ".join(name for name in getattr(model, "extras", ()) if name not in getattr(written, "extras", ()))
+    lost = ([f"SH bands above degree {read}"] if read < degree else []) + ([f"the extra columns {extras}"] if extras else [])
+    return f"{' and '.join(lost)} are left out, which loaders of {viewer} do not read right" if lost else ""
+
+
 def wants_filter(viewer: str | None) -> bool:
     """Whether the viewer, or each of a group, reads the column filter_3D."""
     return viewer is not None and all(find_viewer(name).filter_3d for name in viewers_for(viewer))

@@ -10,6 +10,7 @@ from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.adaptation.optimization.amount import fewer_note
 from mipmap_plugin.adaptation.report import Report, filters, simulated, versions
 from mipmap_plugin.formats.ply import read_header
+from mipmap_plugin.models.mip import unread
 from mipmap_plugin.tiles.scene import TiledScene
 
 
@@ -19,6 +20,7 @@ def make_report(scene: TiledScene, files: Sequence[Path], seconds: dict[str, flo
     model, config = scene.wrapped.model, scene.config
     large = fewer_note(scene.asked_steps, config)
     lost = [f"the extra columns {', '.join(scene.extras)} are dropped, since tiles hold none"] if scene.extras else []
+    lost += [sentence for sentence in [unread(scene.viewer, model, files[0])] if sentence]
     for note in lost:
         warnings.warn(note, stacklevel=2)
     psnr = validation.get(returned, 0.0)

@@ -33,6 +33,15 @@ def test_columns_that_tiles_do_not_hold_are_told_of(job):
         assert make_report(scene, [file], {"total": 1.0}, {}, "the start").notes
 
 
+def test_bands_that_the_loader_of_a_viewer_does_not_read_are_told_of(job):
+    [file] = job.base.checkpoint.rglob("*.ply")
+    tiny.model(80).with_degree(4).save(file, provenance={}, overwrite=True)
+    scene = cut_in_three(job)
+    scene.viewer = "spark"
+    with pytest.warns(UserWarning, match="SH bands above degree 3 are left out, which loaders of spark do not read right"):
+        assert make_report(scene, [file], {"total": 1.0}, {}, "the start").notes
+
+
 def test_places_that_float32_does_not_hold_are_told_of(job):
     [file] = job.base.checkpoint.rglob("*.ply")
     columns = read_ply(file).columns
