@@ -26,8 +26,7 @@ WRITTEN = (
     "nerfstudio_models/*.ckpt", "deform/*/deform.pth", "point_cloud/*/point_cloud.ply", "point_cloud/*/*.pt", "point_cloud/*/*.pth", f"*{REPORT}",
 )  # fmt: skip
 
-# World units: SPZ, as splat-transform writes it, has 24 bits for a coordinate, 12 of them for parts of a unit. Splats farther away would be put 4,096
-# units elsewhere without a word.
+# World units: a single splat farther away leaves SPZ fewer than the usual 12 bits for fractions of a unit, for the positions of all (`formats.spz`).
 SPZ_REACH = 2048.0
 
 # Finite numbers that in float32 activate as an infinite logit and logarithm do: to an opacity of 1 or 0, and a length of almost 0.
@@ -82,7 +81,7 @@ def refuse_format(path: Path, trained: TrainedScale, means: Tensor) -> None:
 def refuse_far(path: Path, means: Tensor, instead: str) -> None:
     """Raise SettingsError for centers [N, 3] that SPZ has no place for. `instead`: what else can be done."""
     if far := int((means.detach().abs() >= SPZ_REACH).any(dim=1).sum()):
-        where = f"lie {SPZ_REACH:,.0f} or more units from the origin along an axis, where SPZ has no place for them"
+        where = f"lie {SPZ_REACH:,.0f} or more units from the origin along an axis, for which SPZ would round all positions to more than 1/4096 unit"
         raise SettingsError(f"{path}: {far:,} of {len(means):,} splats {where}; remove them, move or shrink the scene, or {instead}")
 
 

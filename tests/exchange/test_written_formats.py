@@ -156,9 +156,9 @@ def moved_by(offset):
 
 
 def test_spz_is_not_written_of_splats_that_are_too_far_away_for_it(tmp_path, tool):
-    """Their coordinates would begin anew after 2,048 units, at -2,048."""
+    """They would leave fewer bits for fractions than the 12 that other writers have, for all positions."""
     far = moved_by(-2060.0)
-    refused = r"60 of 60 splats lie 2,048 or more units from the origin .*; remove them, move or shrink the scene, or give a .sog or a .ply"
+    refused = r"60 of 60 splats lie 2,048 or more units from the origin .* 1/4096 unit; remove them, .*shrink the scene, or give a .sog or a .ply"
     with pytest.raises(SettingsError, match=refused):
         far.save(tmp_path / "out.spz", provenance={})
     with pytest.raises(SettingsError, match=refused):  # before any work
