@@ -16,7 +16,7 @@ from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.ply_rows import PlyRows
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.models import Checkpoint, detect
-from mipmap_plugin.models.columns import extra_names
+from mipmap_plugin.models.columns import extra_names, second_colors
 from mipmap_plugin.models.health import MIN_DISTRIBUTION, coarse, doubts, dropped, examine, refuse_few
 from mipmap_plugin.models.surfels import SurfelModel
 from mipmap_plugin.models.vanilla import VanillaModel
@@ -68,6 +68,7 @@ def make_cut(path: Path, tiles: int, folder: Path) -> None:
     for doubt in told:
         warnings.warn(f"{checkpoint.path}: {doubt}", stacklevel=2)
     told += [] if valid.all() else [dropped(~valid, "splats", "not finite once activated", checkpoint.path)]
+    told += second_colors(rows.header.vertex.names)
     degree_at = found.degree_at if found.highest >= 0 else int(kept[0])
     sample = torch.cat([kept[:: -(-len(kept) // SAMPLE)], torch.tensor([degree_at])]).unique()
     places = torch.where(valid[:, None], splats.places, torch.nan)  # an invalid splat is seen by no camera

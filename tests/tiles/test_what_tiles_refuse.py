@@ -33,6 +33,14 @@ def test_columns_that_tiles_do_not_hold_are_told_of(job):
         assert make_report(scene, [file], {"total": 1.0}, {}, "the start").notes
 
 
+def test_a_second_set_of_colors_that_is_left_out_is_told_of(job):
+    [file] = job.base.checkpoint.rglob("*.ply")
+    columns = read_ply(file).columns
+    write_ply(file, columns | dict.fromkeys(("red", "green", "blue"), columns["x"]), overwrite=True)
+    [note] = make_report(cut_in_three(job), [file], {"total": 1.0}, {}, "the start").notes
+    assert note.startswith("its columns red, green and blue are left out")
+
+
 def test_bands_that_the_loader_of_a_viewer_does_not_read_are_told_of(job):
     [file] = job.base.checkpoint.rglob("*.ply")
     tiny.model(80).with_degree(4).save(file, provenance={}, overwrite=True)
