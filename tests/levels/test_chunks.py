@@ -180,7 +180,7 @@ def test_finished_levels_are_cut_together_as_they_are_streamed():
 def test_walks_are_measured_with_the_chunks_that_are_streamed(small_chunks):
     """Those of the base alone are for making the levels: another one has its splats elsewhere."""
     base, request = wrapped(), LadderRequest("classic", coarsest=1 / 4, ratio=2.0, by="distance")
-    scene = scene_of(base, request, request.first_band(base.target("classic"), base.effects()))
+    scene = scene_of(base, request, request.first_band(base))
     levels = [base.model, *[VanillaModel.from_gaussians(scene.splats[:150], base.model.trained)] * (scene.rule.count - 1)]
     streamed = Mixture.streamed(scene.rule, scene.extent, [scene.splats_of(level) for level in levels])
     seen = Walks(scene, levels).seen(scene.views[0], scene.rule.middle(1))
