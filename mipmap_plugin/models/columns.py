@@ -142,9 +142,13 @@ def _with_dc(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
     MetalSplatter knows them of nerfstudio's older files."""
     if DC[0] in columns or not all(name in columns for name in RGB):
         return columns
-    colors = {dc: _unit(columns[name]) for dc, name in zip(DC, RGB, strict=True)}
-    full = 255 if any((column > BRIGHTEST).any() for column in colors.values()) else 1
-    return {**columns, **{dc: (column / full - 0.5) / C0 for dc, column in colors.items()}}
+    full = 255 if has_bright_colors(columns) else 1
+    return {**columns, **{dc: (_unit(columns[name]) / full - 0.5) / C0 for dc, name in zip(DC, RGB, strict=True)}}
+
+
+def has_bright_colors(columns: Mapping[str, np.ndarray]) -> bool:
+    """Whether the colors red, green and blue are floats in 0..255."""
+    return any((columns[name] > BRIGHTEST).any() for name in RGB if name in columns and columns[name].dtype.kind == "f")
 
 
 def _with_logits(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:

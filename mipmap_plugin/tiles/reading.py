@@ -16,7 +16,7 @@ from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.ply_rows import PlyRows
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.models import Checkpoint, detect
-from mipmap_plugin.models.columns import extra_names, second_colors
+from mipmap_plugin.models.columns import DC, RGB, extra_names, has_bright_colors, second_colors
 from mipmap_plugin.models.health import MIN_DISTRIBUTION, coarse, doubts, dropped, examine, refuse_few
 from mipmap_plugin.models.surfels import SurfelModel
 from mipmap_plugin.models.vanilla import VanillaModel
@@ -78,7 +78,13 @@ def make_cut(path: Path, tiles: int, folder: Path) -> None:
 
 
 def _read(rows: PlyRows) -> Iterator[dict[str, Any]]:
-    """The columns of a PLY, some rows at a time."""
+    """The columns of a PLY, some rows at a time. Colors in place of harmonics are in 0..1 if they are floats: a dark part does not tell in what."""
+    full = 255 if DC[0] not in rows.header.vertex.names and any(map(has_bright_colors, _parts(rows))) else 1
+    for columns in _parts(rows):
+        yield columns if full == 1 else {name: column / full if name in RGB else column for name, column in columns.items()}
+
+
+def _parts(rows: PlyRows) -> Iterator[dict[str, Any]]:
     for start in range(0, len(rows), CHUNK):
         yield rows.columns(slice(start, start + CHUNK))
         rows.release()

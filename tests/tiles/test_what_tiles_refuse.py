@@ -15,6 +15,7 @@ from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError, SettingsError
 from mipmap_plugin.formats.magic import SPLAT_RECORD
 from mipmap_plugin.formats.ply import read_ply, write_ply
+from mipmap_plugin.models import load_model
 from mipmap_plugin.models.health import ACTIVATED
 from mipmap_plugin.tiles.folder import work_folder
 from mipmap_plugin.tiles.reading import find_splats, make_cut
@@ -39,6 +40,15 @@ def test_a_second_set_of_colors_that_is_left_out_is_told_of(job):
     write_ply(file, columns | dict.fromkeys(("red", "green", "blue"), columns["x"]), overwrite=True)
     [note] = make_report(cut_in_three(job), [file], {"total": 1.0}, {}, "the start").notes
     assert note.startswith("its columns red, green and blue are left out")
+
+
+def test_colors_up_to_255_are_those_of_the_whole_file_also_where_a_part_is_dark(job, monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.tiles.reading.CHUNK", 30)
+    [file] = job.base.checkpoint.rglob("*.ply")
+    colors = dict.fromkeys(("red", "green", "blue"), np.repeat(np.float32([255, 5]), 40))
+    write_ply(file, {name: column for name, column in read_ply(file).columns.items() if not name.startswith("f_dc")} | colors, overwrite=True)
+    read = cut_in_three(job).base.parameters(torch.arange(80))["sh0"]
+    torch.testing.assert_close(read, load_model(file).parameters()["sh0"], rtol=0, atol=1e-6)
 
 
 def test_bands_that_the_loader_of_a_viewer_does_not_read_are_told_of(job):
