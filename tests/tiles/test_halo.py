@@ -96,7 +96,7 @@ def test_tiles_step_by_rows_where_the_backend_can(job, monkeypatch):
     """And the result is that of autograd, but for rounding, of which Adam's first steps make more."""
     job, steps = replace(job, base=replace(job.base, backend="cpu")), []
     real_step = ByRows.step
-    monkeypatch.setattr(ByRows, "step", lambda self, optimizer: (steps.append(self), real_step(self, optimizer)))
+    monkeypatch.setattr(ByRows, "step", lambda self, *arguments: (steps.append(self), real_step(self, *arguments)))
     by_rows = read_ply(adapt_in_tiles(job, 3).file).columns
     assert len(steps) == 3 * 4  # 4 steps of 3 tiles, whatever a view shows of them
     monkeypatch.setattr(Surroundings, "to_step", None)

@@ -163,4 +163,4 @@ def test_help_says_what_a_time_budget_is_of(capsys):
     with pytest.raises(SystemExit):
         main(["adapt", "--help"])
     said = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "Maximum number of seconds for each file; with --tiles for each tile instead" in said
+    assert "Maximum number of seconds for each file; with --tiles for each tile, and tiles are adapted one after the other without --jobs" in said
