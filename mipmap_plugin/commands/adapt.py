@@ -95,7 +95,7 @@ def adapt(
         return adapt_jobs(many, checkpoints, request, base, threads, json)
     [checkpoint] = checkpoints
     wrapped = wrap(replace(base, checkpoint=checkpoint), threads)
-    most = _most(wrapped, splats, bytes, adapted_path(checkpoint, output, 1.0, several=False), (scale, viewer), settings)
+    most = _most(wrapped, (splats, bytes), (checkpoint, output), (scale, viewer), settings)
     settings, requests = settings | without_none(most_splats=most), _requests(scale or _fitting(wrapped.model, most), viewer)
     files = _files(checkpoint, output, requests)
     before = _finished(jobs_of(checkpoint, Request(requests, output, settings, images, overwrite), base, several=len(files) > 1), files, json)
@@ -186,9 +186,17 @@ def _requests(scales: Sequence[float], viewers: tuple[str, ...]) -> list[tuple[f
 
 
 def _most(
-    base: Wrapped, splats: int | None, size: str | None, output: Path, asked: tuple[Sequence[float], tuple[str, ...]], settings: dict[str, Any]
+    base: Wrapped,
+    limits: tuple[int | None, str | None],
+    paths: tuple[Path, Path | None],
+    asked: tuple[Sequence[float], tuple[str, ...]],
+    settings: dict[str, Any],
 ) -> int | None:
-    """The smaller of a number of splats and of what fits into a size; None if neither is given. `asked`: scales and viewers."""
+    """The smaller of a number of splats and of what fits into a size, the `limits`; None if neither is given.
+
+    `paths`: the checkpoint and the output; `asked`: scales and viewers.
+    """
+    splats, size = limits
     if splats is not None and splats < 1:
         raise SettingsError(f"splats: must be at least 1, got {splats}")
     if size is None:
@@ -196,7 +204,10 @@ def _most(
     from mipmap_plugin.levels.fitting import ANY_SCALE, read_size, recorded, splats_within
 
     most, (scales, viewers) = read_size(size), asked
-    within = splats_within(base.model, most, output.name, recorded(base, _requests(scales or [ANY_SCALE], viewers), settings))
+    requests = _requests(scales or [ANY_SCALE], viewers)
+    record = recorded(base, requests, settings)
+    targets = [adapted_path(*paths, 1.0, viewer, several=len(requests) > 1) for viewer in viewers or (None,)]  # a viewer may want another format
+    within = min(splats_within(base.model, most, target.name, record) for target in {target.suffix: target for target in targets}.values())
     return within if splats is None else min(within, splats)
 
 
