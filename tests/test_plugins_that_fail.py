@@ -12,6 +12,7 @@ import torch
 from mipmap_plugin import register_backend, register_model, register_recipe, register_upsampler, register_viewer, wrap_model
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.base import Rendered
+from mipmap_plugin.backends.conformance import CASES, check_backend, summary
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import OutputExists, PluginError, SettingsError
@@ -93,6 +94,18 @@ def test_wrong_gradients_of_a_backend_are_told_by_its_name(render, said):
     base.adapt(2, recipe="instant", closed_form=False)  # which has no gradients
     with pytest.raises(PluginError, match=said):
         base.adapt(0.5, **BRIEF)
+
+
+def by_splats(rendered, _):
+    """As drawn by a loop over the splats in view: without gradients where there are none."""
+    return rendered if (rendered.image != rendered.image[:1, :1]).any() else Rendered(rendered.image.detach(), rendered.alpha.detach())
+
+
+def test_an_image_of_nothing_may_come_without_gradients():
+    base = backend(by_splats)
+    assert base.adapt(0.25, **(BRIEF | dict(merge_to=0.5))).report.curve  # which meets images of one pixel
+    outcomes = check_backend(base.backend()[0].theirs, {name: CASES[name] for name in ("no-splat", "no-splat-in-view")})
+    assert summary(outcomes) == "2 cases: 2 run, 0 skipped, 0 failed"
 
 
 @pytest.mark.parametrize("alpha", [None, torch.zeros(3, 3)])
