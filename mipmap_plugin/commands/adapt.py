@@ -218,16 +218,19 @@ def _fitting(model: SplatModel, most: int | None) -> Sequence[float]:
     return () if most is None else (fitting_scale(most, model),)
 
 
-def _made_for(report: Report, model: SplatModel) -> str:
+def _made_for(report: Report, model: SplatModel, saved: Path) -> str:
     """What a file is made for, and how to have one made for something else."""
     from mipmap_plugin.effects import NEAR_PLANE
     from mipmap_plugin.models.base import why_no_viewer
+    from mipmap_plugin.plugin_errors import is_third_party
 
     if report.viewer:
         return f"made for {report.viewer}"
     if why_no_viewer(model):
         return "made for its own project"
     advice = "; for others give --viewer spark, supersplat, ..."
+    if is_third_party(model) and saved.suffix.lower() != ".ply":  # which no other program reads
+        return f"made for its own project{advice}"
     if (trained := model.trained).keeps_filter:
         return f"made for its own project, whose filter it keeps{advice}"
     if trained.screen_filter != "classic":
@@ -240,7 +243,7 @@ def _say(saved: Path, report: Report, model: SplatModel) -> None:
     """Two lines, what and where; the rest goes to the log."""
     splats = f"{report.gaussians_before:,} -> {report.gaussians_after:,} splats, {report.seconds['total']:.1f} s"
     say(f"x{report.scale:g}{f' in {report.viewer}' if report.viewer else ''}: {report.gain()}, {splats}")
-    say(f"{saved}, {_made_for(report, model)}")
+    say(f"{saved}, {_made_for(report, model, saved)}")
     for line in _details(report):
         detail(f"  {line}")
 
