@@ -227,12 +227,12 @@ class FrozenBase:
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = True, viewer: str | None = None) -> None:
         """Raise now the error that saving a model adapted for `viewer` to `path` would raise at the end, as far as it can be predicted."""
-        report, source = named(path).with_name(named(path).name + REPORT), self.model.source
-        parts = parts_of(source, self.model.folder)
+        source, parts = self.model.source, parts_of(self.model.source, self.model.folder)
         model = cast(Filtered, self.model).bare() if viewer is not None and self.model.traits.filtered else self.model
         refuse_unread(path, [own_name(name) for name in viewers_for(viewer)] if viewer else [])
-        model.refuse_output(path, overwrite=overwrite, networks_move=networks_move)
-        refuse_output(report, overwrite, parts, is_file=True)
+        with naming_any({f"family {model.family!r}": model}):
+            model.refuse_output(path, overwrite=overwrite, networks_move=networks_move)
+        refuse_output(named(path).with_name(named(path).name + REPORT), overwrite, parts, is_file=True)
         refuse_output(state_path(path), True, parts, is_file=True)
         refuse_unwritable(path, 0 if source is None else source.stat().st_size)
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from mipmap_plugin.errors import MipmapPluginError, PluginError
+from mipmap_plugin.errors import MipmapPluginError, PluginError, ShapeError
 from mipmap_plugin.limits import is_out_of_memory
 
 if TYPE_CHECKING:
@@ -37,11 +37,14 @@ def naming(what: str) -> Iterator[None]:
 
 @contextmanager
 def naming_any(plugins: Mapping[str, Any]) -> Iterator[None]:
-    """Turn errors that pass through the code of a third-party plug-in into a PluginError. `plugins`: objects by what messages call them."""
+    """Turn errors that pass through the code of a third-party plug-in into a PluginError. `plugins`: objects by what messages call them.
+
+    Those of this package stay as they are, but for a ShapeError, which does not say whose tensors do not fit together.
+    """
     try:
         yield
     except (Exception, SystemExit) as error:
-        if isinstance(error, MipmapPluginError) or is_out_of_memory(error):
+        if (isinstance(error, MipmapPluginError) and not isinstance(error, ShapeError)) or is_out_of_memory(error):
             raise
         for what, thing in plugins.items():
             if is_third_party(thing) and any(_is_of(frame, thing) for frame, _ in traceback.walk_tb(error.__traceback__)):

@@ -133,6 +133,20 @@ def test_splats_of_covariances_are_merged():
     assert merged.psnr_after() == pytest.approx(plain.psnr_after(), abs=0.5)
 
 
+class Factors(Ellipsoids):
+    """Its parameters are no scales and quaternions either."""
+
+    def parameters(self):
+        raw = super().parameters()
+        return {"means": raw["means"], "features": raw["scales"], "opacities": raw["opacities"], "sh0": raw["sh0"]}
+
+
+def test_inspect_examines_splats_of_covariances(tmp_path, capsys):
+    file = registered(tmp_path / "a.own", lambda path, iteration: Factors(tiny.model().parameters(), TrainedScale(), Origin(path)))
+    assert main(["inspect", str(file), "--no-viewers"]) == 0
+    assert "sound; next: " in capsys.readouterr().out
+
+
 class Leafless(Tinted):
     def shared_parameters(self):
         return {"tint": self.tint * 1}

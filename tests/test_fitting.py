@@ -3,13 +3,15 @@
 import json
 import re
 
+import gltf_files
 import pytest
 import tiny
 
 from mipmap_plugin import cli, load_model
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import OutputError, SettingsError
 from mipmap_plugin.formats.ply import read_header
-from mipmap_plugin.levels.fitting import UNKNOWN, fitting_scale, read_size, splats_within
+from mipmap_plugin.levels.fitting import ARCHIVE, UNKNOWN, fitting_scale, read_size, splats_within
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.recipes import recipe, scale_of_fraction
 
 # Bytes of a splat with SH of degree 1, in float32: a mean and a normal, 4 coefficients of 3 colors, an opacity, scales and a quaternion.
@@ -45,6 +47,28 @@ def test_as_many_splats_as_fit_into_a_file_do_fit(tmp_path):
     assert splats_within(model, 10**9, "file.ply", {}) == 500
     with pytest.raises(SettingsError, match="hold no splat"):
         splats_within(model, 3000, "file.ply", record)
+
+
+class Own(VanillaModel):
+    """Of a family that saves nothing but files of its own ending."""
+
+    def save(self, path, *, provenance, overwrite=False):
+        if path.suffix != ".own":
+            raise OutputError(f"{path}: give a name that ends in .own")
+        return super().save(path.with_suffix(".ply"), provenance=provenance, overwrite=overwrite).rename(path)
+
+
+def test_files_of_a_third_party_family_are_measured_under_their_own_ending():
+    model = Own(tiny.model(500).parameters())
+    assert splats_within(model, 40_000, "file_x0.5.own", {}) == pytest.approx((40_000 - ARCHIVE) / ROW, rel=0.05)
+
+
+def test_what_is_written_for_a_viewer_is_measured_in_the_format_of_that(tmp_path):
+    """A PLY for one that reads no glTF, which has fewer bytes for each splat."""
+    base, size = tmp_path / "base.glb", 6_000
+    gltf_files.glb(base, tiny.gaussians(60))
+    assert cli.main(["adapt", str(base), "--bytes", str(size), "--viewer", "spark", "--viewer", "three", "--recipe", "instant", "--scale", "1"]) == 0
+    assert [file.stat().st_size <= size for file in sorted(tmp_path.glob("base_*_*[!n]"))] == [True, True]
 
 
 OPTIONS = [[], ["--viewer", "spark"], ["--viewer", "mip"], ["--scale", "1/3"], ["--viewer", "portable", "--recipe", "thorough"]]

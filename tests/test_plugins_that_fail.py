@@ -12,14 +12,17 @@ import torch
 from mipmap_plugin import register_backend, register_model, register_recipe, register_upsampler, register_viewer, wrap_model
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.base import Rendered
+from mipmap_plugin.backends.conformance import CASES, check_backend, summary
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import OutputExists, PluginError, SettingsError
+from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import API_VERSION, CERTAIN, Family, Match, detect
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.plugin_errors import naming_any
 from mipmap_plugin.recipes import default
 from mipmap_plugin.render_settings import EvenBuckets, Packing, RenderSettings
+from mipmap_plugin.splatting.rotations import rotations
 from mipmap_plugin.splatting.viewers import Viewer, single_viewers
 
 
@@ -91,6 +94,18 @@ def test_wrong_gradients_of_a_backend_are_told_by_its_name(render, said):
     base.adapt(2, recipe="instant", closed_form=False)  # which has no gradients
     with pytest.raises(PluginError, match=said):
         base.adapt(0.5, **BRIEF)
+
+
+def by_splats(rendered, _):
+    """As drawn by a loop over the splats in view: without gradients where there are none."""
+    return rendered if (rendered.image != rendered.image[:1, :1]).any() else Rendered(rendered.image.detach(), rendered.alpha.detach())
+
+
+def test_an_image_of_nothing_may_come_without_gradients():
+    base = backend(by_splats)
+    assert base.adapt(0.25, **(BRIEF | dict(merge_to=0.5))).report.curve  # which meets images of one pixel
+    outcomes = check_backend(base.backend()[0].theirs, {name: CASES[name] for name in ("no-splat", "no-splat-in-view")})
+    assert summary(outcomes) == "2 cases: 2 run, 0 skipped, 0 failed"
 
 
 @pytest.mark.parametrize("alpha", [None, torch.zeros(3, 3)])
@@ -168,6 +183,20 @@ def moving_itself(self, camera=None):
     return VanillaModel.gaussians(self, camera)
 
 
+def raw_scales(self, camera=None):
+    return replace(VanillaModel.gaussians(self, camera), scales=self.parameters()["scales"])
+
+
+def with_covariances(made):
+    """A method of a family that makes covariances of their factors."""
+
+    def gaussians(self, camera=None):
+        splats = VanillaModel.gaussians(self, camera)
+        return replace(splats, covariances=made(rotations(splats.quats) * splats.scales[:, None, :]))
+
+    return gaussians
+
+
 @pytest.mark.parametrize(
     ("gaussians", "said"),
     [
@@ -178,6 +207,9 @@ def moving_itself(self, camera=None):
             r"family 'theirs': gaussians\(\) returned NaN or infinity in means",
         ),
         (moving_itself, r"family 'theirs' changed its input in place \(means\)"),
+        (raw_scales, r"family 'theirs': gaussians\(\) returned negative scales, which have to be lengths; activate them by exp"),
+        (with_covariances(lambda factors: factors), r"returned covariances that are not symmetric; of a factor L give L @ L\.mT"),
+        (with_covariances(lambda factors: -factors @ factors.mT), "returned covariances with negative variances on the diagonal; check"),
     ],
 )
 def test_what_a_family_does_wrong_is_told_by_its_name(gaussians, said):
@@ -227,6 +259,25 @@ def test_a_family_that_breaks_its_contract_is_told_before_the_base_changes(metho
 
 def test_splats_without_gradients_may_be_adapted_without_steps():
     assert family(gaussians=detached).adapt(0.5, recipe="instant", merge_to=1.0).report.gaussians_after == 60
+
+
+def without_room(self, path, *, overwrite, networks_move=False):
+    return {}["room"]
+
+
+def test_a_family_that_fails_before_the_work_begins_is_told_by_its_name(tmp_path):
+    with pytest.raises(PluginError, match="family 'theirs' failed: KeyError: 'room'"):
+        family(refuse_output=without_room).refuse_output(tmp_path / "new.ply", overwrite=False)
+
+
+def half_doubles(self, form, views=()):
+    raw = {name: tensor.detach() for name, tensor in self.parameters().items()}
+    Gaussians(raw["means"].double(), raw["quats"], raw["scales"], raw["opacities"], raw["sh0"])
+
+
+def test_shapes_that_a_family_mixes_up_are_told_by_its_name():
+    with pytest.raises(PluginError, match="family 'theirs' failed: ShapeError: quats: "):
+        family(reshape=half_doubles).adapt(0.5, recipe="instant")
 
 
 def test_a_family_that_does_not_say_what_it_wrote_is_told(tmp_path):

@@ -16,8 +16,12 @@ from mipmap_plugin.commands.list import _facts as facts_of
 from mipmap_plugin.errors import BackendUnavailable, PluginError, SettingsError
 from mipmap_plugin.evaluation.backends import check, listing, listing_table
 from mipmap_plugin.registry import Registry, load_target
+from mipmap_plugin.splatting.viewers import Viewer, single_viewers, viewers_for
 
 NEEDS = Needs("cpu", torch.float32, gradients=True, sh_degree=1, screen_filter="classic")
+
+
+KIOSK = Viewer("kiosk", "Kiosk", "ours", "classic", 0.3)
 
 
 class Fast(ReferenceBackend):
@@ -180,6 +184,14 @@ def test_an_installed_backend_is_seen_and_used(install):
 def test_an_installed_package_cannot_shadow_a_built_in(install):
     install("reference", f"{__name__}:Fussy")
     assert type(get_backend("reference")) is ReferenceBackend
+
+
+def test_a_viewer_of_a_package_has_a_name_that_files_can_have_too(install):
+    install("our/kiosk", f"{__name__}:KIOSK", "mipmap_plugin.viewers")
+    told = "viewers are named in files: a name begins with a letter or a digit"
+    assert f"not used: {told}" in facts_of("viewers")["of packages"]["our/kiosk"] and "our/kiosk" not in single_viewers()
+    with pytest.raises(PluginError, match=told):
+        viewers_for("our/kiosk")
 
 
 def test_of_two_packages_with_one_name_the_first_is_used_and_the_other_is_told(monkeypatch):

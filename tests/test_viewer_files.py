@@ -2,6 +2,7 @@
 
 import gc
 import weakref
+from pathlib import Path
 from unittest.mock import Mock
 
 import anchor_checkpoints
@@ -167,8 +168,14 @@ def test_the_command_says_whom_a_file_without_a_viewer_is_for(tmp_path, capsys):
     assert f"{renderers}; for others give --viewer spark" in capsys.readouterr().out
 
 
+def test_a_file_of_a_third_party_format_is_for_its_own_project():
+    theirs = type("Theirs", (VanillaModel,), {"__module__": "theirs"})(tiny.model(3).parameters())
+    assert _made_for(Mock(viewer=None), theirs, Path("a.npz")).startswith("made for its own project; for others give --viewer")
+    assert "draw as 3DGS does" in _made_for(Mock(viewer=None), theirs, Path("a.ply"))
+
+
 def test_a_file_of_a_base_that_gsplat_trained_is_for_inria_s_viewer_too_if_nothing_is_near():
-    said = _made_for(Mock(viewer=None), tiny.model(3, TrainedScale(near_plane=0.01)))
+    said = _made_for(Mock(viewer=None), tiny.model(3, TrainedScale(near_plane=0.01)), Path("a.ply"))
     assert "3DGS does (gsplat, nerfstudio, and INRIA where no splat is nearer than 0.2 units)" in said
 
 

@@ -227,7 +227,7 @@ class Stepper(Protocol):
 class Backend(Protocol):
     """Renders Gaussians to an image with one sample per pixel; supersampling, depth and normals are built on top (`supersample`, `geometry`).
 
-    A row with NaN or infinity has no effect, and a gradient of 0.
+    A row with NaN or infinity has no effect, and a gradient of 0. An image of nothing may come without gradients.
 
     Attributes:
         name: As in `--backend`.

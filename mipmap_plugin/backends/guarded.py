@@ -52,11 +52,16 @@ class Guarded:
         if not image.isfinite().all():
             view = f"{camera.name or 'a view'}, {camera.width} x {camera.height} px"
             raise PluginError(f"{self._title} returned an image with NaN or infinity, of {view}")
-        if torch.is_grad_enabled() and not image.requires_grad and any(tensor.requires_grad for tensor in _tensors(gaussians).values()):
-            shows = bool((image != image[:1, :1]).any())  # an image of nothing has no gradients
-            if shows and not self.theirs.lacking(Needs.of(gaussians, effects, gradients=True)):
-                raise PluginError(f"{self._title} returned an image without gradients, and does not say in `lacking` that it has none")
-        return rendered.replaced(alpha=partial(self._alpha, rendered, wanted[:2]))
+        return rendered.replaced(image=self._joined(image, gaussians, effects), alpha=partial(self._alpha, rendered, wanted[:2]))
+
+    def _joined(self, image: Tensor, gaussians: Gaussians, effects: Effects) -> Tensor:
+        """The image as a part of the gradient graph: one of nothing may come without gradients, which are 0. Raises PluginError for any other."""
+        differentiable = [tensor for tensor in _tensors(gaussians).values() if tensor.requires_grad] if torch.is_grad_enabled() else []
+        if image.requires_grad or not differentiable or self.theirs.lacking(Needs.of(gaussians, effects, gradients=True)):
+            return image
+        if (image != image[:1, :1]).any():
+            raise PluginError(f"{self._title} returned an image without gradients, and does not say in `lacking` that it has none")
+        return image + differentiable[0][:0].sum()
 
     def _alpha(self, rendered: Rendered, wanted: tuple[int, ...]) -> Tensor:
         with naming(self._title):

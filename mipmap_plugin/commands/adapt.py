@@ -95,7 +95,7 @@ def adapt(
         return adapt_jobs(many, checkpoints, request, base, threads, json)
     [checkpoint] = checkpoints
     wrapped = wrap(replace(base, checkpoint=checkpoint), threads)
-    most = _most(wrapped, splats, bytes, adapted_path(checkpoint, output, 1.0, several=False), (scale, viewer), settings)
+    most = _most(wrapped, (splats, bytes), (checkpoint, output), (scale, viewer), settings)
     settings, requests = settings | without_none(most_splats=most), _requests(scale or _fitting(wrapped.model, most), viewer)
     files = _files(checkpoint, output, requests)
     before = _finished(jobs_of(checkpoint, Request(requests, output, settings, images, overwrite), base, several=len(files) > 1), files, json)
@@ -186,9 +186,17 @@ def _requests(scales: Sequence[float], viewers: tuple[str, ...]) -> list[tuple[f
 
 
 def _most(
-    base: Wrapped, splats: int | None, size: str | None, output: Path, asked: tuple[Sequence[float], tuple[str, ...]], settings: dict[str, Any]
+    base: Wrapped,
+    limits: tuple[int | None, str | None],
+    paths: tuple[Path, Path | None],
+    asked: tuple[Sequence[float], tuple[str, ...]],
+    settings: dict[str, Any],
 ) -> int | None:
-    """The smaller of a number of splats and of what fits into a size; None if neither is given. `asked`: scales and viewers."""
+    """The smaller of a number of splats and of what fits into a size, the `limits`; None if neither is given.
+
+    `paths`: the checkpoint and the output; `asked`: scales and viewers.
+    """
+    splats, size = limits
     if splats is not None and splats < 1:
         raise SettingsError(f"splats: must be at least 1, got {splats}")
     if size is None:
@@ -196,7 +204,10 @@ def _most(
     from mipmap_plugin.levels.fitting import ANY_SCALE, read_size, recorded, splats_within
 
     most, (scales, viewers) = read_size(size), asked
-    within = splats_within(base.model, most, output.name, recorded(base, _requests(scales or [ANY_SCALE], viewers), settings))
+    requests = _requests(scales or [ANY_SCALE], viewers)
+    record = recorded(base, requests, settings)
+    targets = [adapted_path(*paths, 1.0, viewer, several=len(requests) > 1) for viewer in viewers or (None,)]  # a viewer may want another format
+    within = min(splats_within(base.model, most, target.name, record) for target in {target.suffix: target for target in targets}.values())
     return within if splats is None else min(within, splats)
 
 
@@ -207,16 +218,19 @@ def _fitting(model: SplatModel, most: int | None) -> Sequence[float]:
     return () if most is None else (fitting_scale(most, model),)
 
 
-def _made_for(report: Report, model: SplatModel) -> str:
+def _made_for(report: Report, model: SplatModel, saved: Path) -> str:
     """What a file is made for, and how to have one made for something else."""
     from mipmap_plugin.effects import NEAR_PLANE
     from mipmap_plugin.models.base import why_no_viewer
+    from mipmap_plugin.plugin_errors import is_third_party
 
     if report.viewer:
         return f"made for {report.viewer}"
     if why_no_viewer(model):
         return "made for its own project"
     advice = "; for others give --viewer spark, supersplat, ..."
+    if is_third_party(model) and saved.suffix.lower() != ".ply":  # which no other program reads
+        return f"made for its own project{advice}"
     if (trained := model.trained).keeps_filter:
         return f"made for its own project, whose filter it keeps{advice}"
     if trained.screen_filter != "classic":
@@ -229,7 +243,7 @@ def _say(saved: Path, report: Report, model: SplatModel) -> None:
     """Two lines, what and where; the rest goes to the log."""
     splats = f"{report.gaussians_before:,} -> {report.gaussians_after:,} splats, {report.seconds['total']:.1f} s"
     say(f"x{report.scale:g}{f' in {report.viewer}' if report.viewer else ''}: {report.gain()}, {splats}")
-    say(f"{saved}, {_made_for(report, model)}")
+    say(f"{saved}, {_made_for(report, model, saved)}")
     for line in _details(report):
         detail(f"  {line}")
 

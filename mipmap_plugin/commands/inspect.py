@@ -67,11 +67,12 @@ def _facts(checkpoint: Path, wrapped: Wrapped, given: Path | None, *, whole: boo
     from mipmap_plugin.models.base import effects_of
     from mipmap_plugin.models.health import examine, holds_splats
     from mipmap_plugin.models.vanilla import VanillaModel
+    from mipmap_plugin.splatting.eigen import by_axes
 
     model = wrapped.model
     with announced("examining"):
         gaussians = model.gaussians(wrapped.views()[0])
-        health = examine(model if holds_splats(model) else VanillaModel.from_gaussians(gaussians, model.trained))
+        health = examine(model if holds_splats(model) else VanillaModel.from_gaussians(by_axes(gaussians), model.trained))
         effects = explain(wrapped.effects(), gaussians, effects_of(model))
         lost = remarks(wrapped.views(), model, wrapped.effects().near_plane, orbit=not wrapped.cameras)
         told = [*health.sentences(), *lost, *filter(None, [too_unlike(wrapped.views())])]

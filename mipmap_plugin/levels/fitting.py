@@ -75,7 +75,7 @@ def splats_within(model: SplatModel, size: int, name: str, record: dict[str, Any
     count = len(model.parameters()["means"])
     ending = next((each for each in ENDINGS if name.lower().endswith(each)), "")
     with tempfile.TemporaryDirectory(prefix=TEMPORARY) as folder:
-        every = Path(folder, f"all{ending}")
+        every = Path(folder, f"all{ending}" if ending else f"all_{name}")  # a third-party family may know its files by their ending
         own = contract.save(for_loader_of(record.get("viewer"), model, every), every, record)
         besides, all_of_them = read_header(own).body if own.suffix == ".ply" else 0, own.stat().st_size
     if own.suffix == ".ply":

@@ -32,6 +32,9 @@ TIME, BY_VIEW = "time", "view-dependent geometry"
 # By which the activation of a third-party family may leave 0..1.
 OPACITY_ROUNDING = 1e-4
 
+# By how much of its largest entry a third-party family's covariance may lack symmetry, or a variance be below 0.
+COVARIANCE_ROUNDING = 1e-3
+
 
 @dataclass(frozen=True)
 class TrainedScale:
@@ -228,7 +231,22 @@ def checked_splats(model: SplatModel, camera: Camera) -> Gaussians:
     if least < -OPACITY_ROUNDING or most > 1 + OPACITY_ROUNDING:
         outside = f"opacities from {float(least):.3g} to {float(most):.3g}"
         raise PluginError(f"family {model.family!r}: gaussians() returned {outside}, which have to lie in 0..1; activate or clamp them")
+    if shapeless := _no_shapes(gaussians):
+        raise PluginError(f"family {model.family!r}: gaussians() returned {shapeless}")
     return gaussians
+
+
+@torch.no_grad()
+def _no_shapes(gaussians: Gaussians) -> str:
+    """Why scales are no lengths, or covariances are none, and what to do; empty if they are."""
+    if gaussians.covariances is None:
+        negative = bool((gaussians.scales < 0).any())
+        return "negative scales, which have to be lengths; activate them by exp(), or take abs()" if negative else ""
+    slack = COVARIANCE_ROUNDING * gaussians.covariances.abs().amax((1, 2), keepdim=True)
+    if ((gaussians.covariances - gaussians.covariances.mT).abs() > slack).any():
+        return "covariances that are not symmetric; of a factor L give L @ L.mT"
+    negative = bool((gaussians.covariances.diagonal(dim1=1, dim2=2) < -slack[:, :, 0]).any())
+    return "covariances with negative variances on the diagonal; check their signs and the order of their numbers" if negative else ""
 
 
 @torch.no_grad()

@@ -19,7 +19,7 @@ from mipmap_plugin.models.anchors.scaffold import scaffold_in_memory
 from mipmap_plugin.models.base import CARRIED, OPACITY_ROUNDING, SplatModel, TrainedScale, tensors_of
 from mipmap_plugin.models.contract import lacking
 from mipmap_plugin.models.gsplat import model as gsplat
-from mipmap_plugin.models.health import rows_where, without_invalid
+from mipmap_plugin.models.health import holds_splats, rows_where, without_invalid
 from mipmap_plugin.models.surfels import FLAT, SurfelModel, flat_trained
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 
@@ -142,7 +142,7 @@ def _advice(model: Any, tensors: Mapping[str, Any]) -> str:
 
 def _checked(model: SplatModel) -> SplatModel:
     """The model without splats that are not finite. Raises SettingsError for NaN in a model of another class, whose rows cannot be dropped."""
-    if isinstance(model, VanillaModel):
+    if isinstance(model, VanillaModel) and holds_splats(model):  # a class derived from it may have other parameters
         return without_invalid(model)
     for name, tensor in model.parameters().items():
         if rows := rows_where(torch.isnan, tensor.detach()):

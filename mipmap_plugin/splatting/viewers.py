@@ -151,6 +151,7 @@ BUILT_IN = (
 
 # What a name may be: files that are adapted for the viewer have it in theirs.
 IN_FILES = re.compile(r"\w[\w.+-]*")
+NOT_IN_FILES = "viewers are named in files: a name begins with a letter or a digit, and has . _ + - beside these, got {name!r}"
 
 ALIASES = {
     "inria": "classic",
@@ -170,7 +171,7 @@ def register_viewer(name: str, viewer: Viewer | tuple[str, ...] | str, *, replac
     """Register a viewer under `name`: a record, or `"package.module:RECORD"`, which is imported at first use; or a group, given by the
     names of registered viewers, that one file has to suit. Raises SettingsError for a name that is taken, or cannot be part of a file's."""
     if isinstance(name, str) and not IN_FILES.fullmatch(name):
-        raise SettingsError(f"viewers are named in files: a name begins with a letter or a digit, and has . _ + - beside these, got {name!r}")
+        raise SettingsError(NOT_IN_FILES.format(name=name))
     VIEWERS.add(name, viewer, replace=replace)
 
 
@@ -184,7 +185,10 @@ register_viewer("portable", tuple(viewer.name for viewer in BUILT_IN if viewer n
 def _registered(name: str) -> Any:
     if isinstance(name, str) and name in NO_RECORD and name not in VIEWERS.names():
         raise SettingsError(f"viewer {name}: {NO_RECORD[name]}")
-    return VIEWERS.get(name)
+    viewer = VIEWERS.get(name)
+    if not IN_FILES.fullmatch(name):  # of an entry point
+        raise PluginError(NOT_IN_FILES.format(name=name))
+    return viewer
 
 
 def own_name(name: str) -> str:

@@ -160,7 +160,8 @@ def draw(backend: Backend, case: HardCase, *, differentiate: bool = True) -> Ans
     if differentiate:
         weights = torch.rand(*case.camera.size, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 2 - 1
         loss = (torch.cat([image, alpha], -1) * weights.to(image)).sum()
-        grads = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True, materialize_grads=True)
+        grads = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True, materialize_grads=True) if loss.requires_grad else ()
+        grads = grads or tuple(map(torch.zeros_like, leaves.values()))  # of an image of nothing, which may come without
         gradients = {name: _plain(grad) for name, grad in zip(leaves, grads, strict=True)}
     if "covariances" in gradients:  # a covariance is symmetric: only the symmetric part of its gradient is meaningful
         gradients["covariances"] = (gradients["covariances"] + gradients["covariances"].mT) / 2
