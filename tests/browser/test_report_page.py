@@ -267,6 +267,8 @@ def test_the_curve_has_a_mark_for_every_check_and_the_start(open_page: Open, tmp
     page.locator("#curve .mark.start").focus()
     assert "closed form" in page.text_content("#curve .readout")
     assert f"{report['curve'][0]['validation_db']:.2f} dB" in page.text_content("#curve .readout")
+    assert report["curve"][0]["validation_db"] not in report["validation"].values()  # the same state, but other views
+    assert "of the validation views that steer the run; the base's line and the dB above are of the others" in page.text_content("#curve .note")
 
 
 def test_the_page_of_a_base_that_is_returned_as_it_is_has_no_curve(open_page: Open, tmp_path: Path) -> None:
