@@ -221,6 +221,16 @@ def test_a_point_of_the_front_tells_its_figures(open_page: Open, tradeoff: Path)
         assert page.text_content(".readout >> nth=0").startswith(f"{best['name']}, {best['backend']}: {best['psnr_db']['median']:.2f} dB")
 
 
+def test_the_mark_that_the_keyboard_is_on_looks_unlike_all_others(open_page: Open, tradeoff: Path) -> None:
+    """Also one of the front, which is filled without the keyboard."""
+    page = open_page(tradeoff.with_name("report.html"))
+    look = "marks => marks.map(each => { const { fill, stroke } = getComputedStyle(each); return fill + stroke })"
+    page.locator(".skip").focus()
+    page.keyboard.press("Tab")
+    first, *others = page.eval_on_selector_all(".mark", look)
+    assert page.evaluate("document.activeElement.classList.contains('on-front')") and first not in others
+
+
 def test_a_ladder_is_a_curve_over_zoom_with_its_switches_and_levels(open_page: Open, ladder: Path) -> None:
     page, manifest = open_page(ladder.with_name("report.html")), json.loads(ladder.read_text())
     assert page.locator("#levels .switch").count() == len(manifest["switches"]) > 0
