@@ -288,6 +288,14 @@ def test_the_page_of_a_base_that_is_returned_as_it_is_has_no_curve(open_page: Op
     assert page.locator("#provenance").count() == 1 and page.locator("#curve").count() == 0
 
 
+def test_a_page_of_files_for_several_viewers_says_whose_effects_it_tells(open_page: Open, tmp_path: Path) -> None:
+    words = ["adapt", tiny.folder(tmp_path / "base"), "--scale", "1/2", "--recipe", "instant", "--output", tmp_path / "out", "--report"]
+    assert main([str(word) for word in (*words, "--viewer", "spark", "--viewer", "playcanvas")]) == 0
+    page = open_page(next((tmp_path / "out").glob("*.html")))
+    spark, playcanvas = (report["effects"] for report in json.loads(page.text_content("#record"))["adaptations"])
+    assert spark != playcanvas and page.text_content("#effects .note").startswith("Of ×1/2 for spark.")
+
+
 @pytest.mark.slow
 def test_the_page_of_the_demo_works(open_page: Open, tmp_path: Path) -> None:
     run_demo(tmp_path, (0.125, 0.25), report=True)
