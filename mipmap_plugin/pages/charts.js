@@ -94,8 +94,10 @@ function curveChart(report) {
     svg.append(point(place.x(each.seconds), place.y(each.validation_db), name, text, readout));
   }
   const ends = before ? `Shaded, before the first step: ${before}. ` : "";
+  const steers = "The curve is of the validation views that steer the run; the base's line and the dB above are of the others. ";
+  const split = base && !Object.values(report.validation).includes(start.validation_db) ? steers : "";
   return make("figure", { class: "chart" }, make("figcaption", {}, report.title), svg, readout,
-    make("p", { class: "note" }, `${ends}Ended by ${report.ended_by}; the file holds ${report.returned}.`));
+    make("p", { class: "note" }, `${ends}${split}Ended by ${report.ended_by}; the file holds ${report.returned}.`));
 }
 
 /** Both fronts of one scale of a tradeoff: dB over seconds to adapt, and over milliseconds a frame. */

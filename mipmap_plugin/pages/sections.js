@@ -34,7 +34,10 @@ function curveSection() {
 function effectsSection() {
   const item = (effect) => make("li", {}, make("strong", {}, effect.name), ` ${effect.reason}`);
   const on = record.effects.filter((effect) => effect.on), off = record.effects.filter((effect) => !effect.on);
+  // Files for other viewers and zooms have effects of their own, and the page tells the first one's.
+  const [first] = record.adaptations, differ = record.adaptations.some((report) => JSON.stringify(report.effects) !== JSON.stringify(record.effects));
   return section("effects", "What is simulated, and why",
+    ...(differ ? [make("p", { class: "note" }, `Of ${first.title}. Those of the others are in the record of this page.`)] : []),
     make("ul", { class: "effects" }, ...on.map(item)),
     make("details", {}, make("summary", {}, `${off.length} effects that this scene does not call for`), make("ul", { class: "effects off" }, ...off.map(item))));
 }

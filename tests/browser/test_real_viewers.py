@@ -114,17 +114,35 @@ def test_the_demo_looks_as_we_say(browser: Browser, viewer: str) -> None:
     assert likeness(browser, viewer, base, at(base.cameras[:2], 1 / 2)) > ALIKE_IN.get(viewer, ALIKE)
 
 
-@pytest.mark.parametrize(("viewer", "suffix"), [("playcanvas", ".sog"), ("spark", ".sog"), ("spark", ".spz")])
-def test_a_file_of_another_format_looks_as_the_ply(
-    browser: Browser, viewer: str, suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def tool(monkeypatch: pytest.MonkeyPatch) -> None:
+    """splat-transform on the PATH."""
     monkeypatch.setenv("PATH", str(HERE / "node_modules" / ".bin"), prepend=":")
     if find_tool() is None:
         pytest.skip("this needs splat-transform: npm ci --prefix tests/browser")
+
+
+@pytest.mark.parametrize(("viewer", "suffix"), [("playcanvas", ".sog"), ("spark", ".sog"), ("spark", ".spz"), ("three", ".spz")])
+def test_a_file_of_another_format_looks_as_the_ply(browser: Browser, viewer: str, suffix: str, tmp_path: Path, tool: None) -> None:
     adapted = embedded().adapt(1 / 4, recipe="instant")
     views = at(adapted.cameras[:2], 1 / 4)
     first, second = (browser.open(viewer, adapted.save(tmp_path / f"a{ending}")).draw(views, WHITE) for ending in (".ply", suffix))
     assert all(psnr(one, other) > ALIKE for one, other in zip(first, second, strict=True))
+
+
+@pytest.mark.parametrize("viewer", ["spark", "three"])
+def test_an_spz_of_a_tiny_scene_looks_as_the_ply(browser: Browser, viewer: str, tmp_path: Path, tool: None) -> None:
+    """Its splats are 2e-4 units wide. With positions in steps of 1/4096 unit it has 38 dB in Spark."""
+    base, size = embedded(), 1 / 64
+    columns = dict(read_ply(base.model.source).columns)
+    columns |= {axis: columns[axis] * np.float32(size) for axis in "xyz"}
+    smallest = np.float32(-10.0)  # of SPZ's logarithms of scales
+    columns |= {name: np.maximum(columns[name] + np.float32(np.log(size)), smallest) for name in ("scale_0", "scale_1", "scale_2")}
+    scene = wrap_model(write_ply(tmp_path / "a.ply", columns))
+    shrink = torch.tensor([[1, 1, 1, size]] * 3 + [[1, 1, 1, 1]], dtype=torch.float64)
+    views = [replace(view, viewmat=view.viewmat * shrink) for view in at(base.cameras[:2], 1 / 2)]
+    ply, spz = (browser.open(viewer, file).draw(views, WHITE) for file in (scene.model.source, scene.model.save(tmp_path / "a.spz", provenance={})))
+    assert min(map(psnr, ply, spz)) > ALIKE
 
 
 @pytest.mark.parametrize("viewer", VIEWERS)

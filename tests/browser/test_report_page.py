@@ -221,6 +221,16 @@ def test_a_point_of_the_front_tells_its_figures(open_page: Open, tradeoff: Path)
         assert page.text_content(".readout >> nth=0").startswith(f"{best['name']}, {best['backend']}: {best['psnr_db']['median']:.2f} dB")
 
 
+def test_the_mark_that_the_keyboard_is_on_looks_unlike_all_others(open_page: Open, tradeoff: Path) -> None:
+    """Also one of the front, which is filled without the keyboard."""
+    page = open_page(tradeoff.with_name("report.html"))
+    look = "marks => marks.map(each => { const { fill, stroke } = getComputedStyle(each); return fill + stroke })"
+    page.locator(".skip").focus()
+    page.keyboard.press("Tab")
+    first, *others = page.eval_on_selector_all(".mark", look)
+    assert page.evaluate("document.activeElement.classList.contains('on-front')") and first not in others
+
+
 def test_a_ladder_is_a_curve_over_zoom_with_its_switches_and_levels(open_page: Open, ladder: Path) -> None:
     page, manifest = open_page(ladder.with_name("report.html")), json.loads(ladder.read_text())
     assert page.locator("#levels .switch").count() == len(manifest["switches"]) > 0
@@ -267,6 +277,8 @@ def test_the_curve_has_a_mark_for_every_check_and_the_start(open_page: Open, tmp
     page.locator("#curve .mark.start").focus()
     assert "closed form" in page.text_content("#curve .readout")
     assert f"{report['curve'][0]['validation_db']:.2f} dB" in page.text_content("#curve .readout")
+    assert report["curve"][0]["validation_db"] not in report["validation"].values()  # the same state, but other views
+    assert "of the validation views that steer the run; the base's line and the dB above are of the others" in page.text_content("#curve .note")
 
 
 def test_the_page_of_a_base_that_is_returned_as_it_is_has_no_curve(open_page: Open, tmp_path: Path) -> None:
@@ -274,6 +286,14 @@ def test_the_page_of_a_base_that_is_returned_as_it_is_has_no_curve(open_page: Op
     assert main(["adapt", str(base), "--scale", "1", "--output", str(tmp_path / "a.ply"), "--report"]) == 0
     page = open_page(tmp_path / "a.ply.report.html")
     assert page.locator("#provenance").count() == 1 and page.locator("#curve").count() == 0
+
+
+def test_a_page_of_files_for_several_viewers_says_whose_effects_it_tells(open_page: Open, tmp_path: Path) -> None:
+    words = ["adapt", tiny.folder(tmp_path / "base"), "--scale", "1/2", "--recipe", "instant", "--output", tmp_path / "out", "--report"]
+    assert main([str(word) for word in (*words, "--viewer", "spark", "--viewer", "playcanvas")]) == 0
+    page = open_page(next((tmp_path / "out").glob("*.html")))
+    spark, playcanvas = (report["effects"] for report in json.loads(page.text_content("#record"))["adaptations"])
+    assert spark != playcanvas and page.text_content("#effects .note").startswith("Of ×1/2 for spark.")
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@ import { Color, LinearSRGBColorSpace, PerspectiveCamera, Scene, WebGPURenderer }
 import { GLTFGaussianSplatLoaderExtension } from 'three/addons/loaders/GLTFGaussianSplatLoaderExtension.js'
 import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js'
 import { GaussianSplatPLYLoader } from 'three/addons/loaders/GaussianSplatPLYLoader.js'
+import { SPZLoader } from 'three/addons/loaders/SPZLoader.js'
 import { GaussianSplat } from 'three/addons/objects/GaussianSplat.js'
 import { canvas, pose, readPixels } from './common.js'
 
@@ -18,7 +19,7 @@ export async function start(settings) {
   return {
     async open(url) {
       if (splats) scene.remove(splats)
-      splats = url.endsWith('.glb') ? await splatsOfGltf(url) : new GaussianSplat(await new GaussianSplatPLYLoader().loadAsync(url))
+      splats = url.endsWith('.glb') ? await splatsOfGltf(url) : new GaussianSplat(await loaderOf(url).loadAsync(url))
       splats.autoSort = false
       splats.frustumCulled = false
       scene.add(splats)
@@ -36,6 +37,8 @@ export async function start(settings) {
     },
   }
 }
+
+const loaderOf = (url) => (url.endsWith('.spz') ? new SPZLoader() : new GaussianSplatPLYLoader())
 
 async function splatsOfGltf(url) {
   const loader = new GLTFLoader().register((parser) => new GLTFGaussianSplatLoaderExtension(parser))
