@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Hashable
 from contextlib import suppress
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -73,7 +74,7 @@ def compile_back(has_covariances: bool, effects: Effects, merging: bool) -> None
     drawing.draw_back(splats, [drawn], [(picture, pixel)])
     descending.compile_step()
     if merging:
-        compile_merging(splats, effects)
+        compile_merging(has_covariances, replace(effects, sh_degree=0))
 
 
 @cache
@@ -84,8 +85,9 @@ def _splat(has_covariances: bool, effects: Effects) -> SplatArrays:
     return drawing.as_arrays(torch.zeros(1, 3), torch.zeros(1, 4), torch.zeros(1, 3), torch.zeros(1), harmonics, covariances)
 
 
-def compile_merging(splats: SplatArrays, effects: Effects) -> None:
-    """Compile what merging calls, the last first."""
+def compile_merging(has_covariances: bool, effects: Effects) -> None:
+    """Compile what merging calls, the last first. effects: of degree 0, for blend weights need no colors."""
+    splats = _splat(has_covariances, effects)
     means, ones, shapes = splats.means, splats.opacities, np.zeros((len(splats.means), 3, 3), np.float32)
     looking.areas(means, shapes, [ONE_PIXEL], near=0, variance=0)
     looking.finest(means, [ONE_PIXEL], near=0)

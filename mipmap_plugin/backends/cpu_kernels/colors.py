@@ -7,7 +7,7 @@ import numpy as np
 
 from mipmap_plugin.backends.cpu_kernels import inner, layout
 from mipmap_plugin.backends.cpu_kernels.blocks import get, put
-from mipmap_plugin.backends.cpu_kernels.columns import BANDS, apart, load_three
+from mipmap_plugin.backends.cpu_kernels.columns import apart, load_three
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, absolute, both, lowest_bit, maximum, minimum
 from mipmap_plugin.backends.cpu_kernels.layout import HUGE
 from mipmap_plugin.backends.cpu_kernels.memory import load
@@ -25,12 +25,6 @@ def fill_colors(visible, at, stride, view, third, sh, bands, bands_of, block):
         visible &= visible - 1
         red, green, blue = color_of(at + lane * stride, lane, view, third, sh, bands, bands_of)
         block[layout.RED * WIDTH + lane], block[layout.GREEN * WIDTH + lane], block[layout.BLUE * WIDTH + lane] = red, green, blue
-
-
-@inner
-def are_of_third(view, stride):
-    """Whether the colors have harmonics of degree 3 and no others: 16 bands, as many as a vector has lanes."""
-    return view.sh_degree == 3 and stride == 3 * BANDS
 
 
 @inner
@@ -63,7 +57,7 @@ def color_of(at, lane, view, third, sh, bands, bands_of):
     """The color of the splat in a lane, in this view's direction. Its coefficients start at sh[at]; `bands_of`, if `third`: bands lane by lane."""
     half = np.float32(0.5)
     red, green, blue = half, half, half
-    if third:
+    if third is not None:
         band = load(bands_of, lane * WIDTH)
         reds, greens, blues = apart(load_three(sh, at))
         return half + total(band * reds), half + total(band * greens), half + total(band * blues)

@@ -8,7 +8,6 @@ from numba import types
 
 from mipmap_plugin.backends.cpu_kernels import harmonics, inner, layout
 from mipmap_plugin.backends.cpu_kernels.blocks import get, get_part, get_vector, put, put_vector
-from mipmap_plugin.backends.cpu_kernels.colors import are_of_third
 from mipmap_plugin.backends.cpu_kernels.columns import apart, load_three, repeated, thrice, transpose
 from mipmap_plugin.backends.cpu_kernels.lanes import PART, WIDTH, select, wide
 from mipmap_plugin.backends.cpu_kernels.memory import beyond, load, scratch, store
@@ -29,13 +28,13 @@ def new_spaces():
 
 
 @inner
-def grad_colors(view, fourth, rows, size, world, sums, colors, spaces, d_world):
+def grad_colors(view, fourth, third, rows, size, world, sums, colors, spaces, d_world):
     """The gradients through the color: add those of the coefficients if wanted, and those of the means in `d_world`. spaces: `new_spaces`."""
     rays, directions, bands, d_bands, bands_of, d_bands_of = spaces
     for part in range(0, size, PART):
         put_rays(view, beyond(world, part), beyond(rays, part), beyond(directions, part))
     harmonics.basis(get_vector(directions, 0), view.sh_degree, fourth, bands)
-    if are_of_third(view, colors[3]):
+    if third is not None:
         transpose(bands, bands_of)
         for lane in range(size):
             grad_color_of_third(rows[lane], lane, view, colors, sums, bands_of, d_bands_of)

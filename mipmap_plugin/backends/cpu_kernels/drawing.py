@@ -11,6 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from mipmap_plugin.backends.cpu_kernels import compositing, compositing_back, layout, projection, projection_back, rounding, sorting, window_tiles
+from mipmap_plugin.backends.cpu_kernels.columns import BANDS
 from mipmap_plugin.backends.cpu_kernels.records import AT_CENTER, OVER_PIXEL, OVER_WINDOW, Flags, Frame, Limits, Lists, SplatArrays, View
 from mipmap_plugin.backends.cpu_kernels.threads import Team, team
 from mipmap_plugin.camera import Camera
@@ -175,6 +176,7 @@ def _view_of(camera: Camera, effects: Effects, bands: int, covariances: bool, gr
         reshaped=view.culls or view.max_variance < math.inf,
         faded=view.w_end > 0,
         fourth=view.sh_degree > 3,
+        third=view.sh_degree == 3 and bands == BANDS,
     )
     return view, Flags(**{name: True if is_on else None for name, is_on in on.items()})
 

@@ -13,7 +13,7 @@ from numba import types
 from mipmap_plugin.backends.cpu_kernels import culling, ellipses, harmonics, inner, integrals, kernel, layout, windows
 from mipmap_plugin.backends.cpu_kernels.binning import count_tiles
 from mipmap_plugin.backends.cpu_kernels.blocks import get, get_vector, put, put_vector
-from mipmap_plugin.backends.cpu_kernels.colors import are_of_third, clamp_colors, fill_colors
+from mipmap_plugin.backends.cpu_kernels.colors import clamp_colors, fill_colors
 from mipmap_plugin.backends.cpu_kernels.columns import apart, load_four, load_three, transpose
 from mipmap_plugin.backends.cpu_kernels.lanes import PART, WIDTH, absolute, bits, both, lowest_bit, maximum, narrow, select, sqrt, wide
 from mipmap_plugin.backends.cpu_kernels.layout import HUGE
@@ -44,10 +44,9 @@ def project(start, stop, flags, view, splats, table, depths, counts, first_tiles
 
     flags: see `Flags`.
     """
-    covariances, integrated, reshaped, _, fourth = flags
+    covariances, integrated, reshaped, _, fourth, third = flags
     arrays, sh, rows, stride = pointers(splats), pointer(splats.sh), pointer(table), 3 * splats.sh.shape[1]
     outputs = pointer(depths), pointer(counts), pointer(first_tiles)
-    third = are_of_third(view, stride)
     world, seen, block, row_of, bands, bands_of = new_world(), new_seen(), new_block(), new_block(), new_bands(), new_bands()
     for first in range(start, stop, WIDTH):
         size = min(WIDTH, stop - first)
@@ -62,7 +61,7 @@ def project(start, stop, flags, view, splats, table, depths, counts, first_tiles
         visible &= (1 << size) - 1
         if visible != 0:
             harmonics.basis(get_vector(seen, DIRECTION), view.sh_degree, fourth, bands)
-            if third:
+            if third is not None:
                 transpose(bands, bands_of)
             fill_colors(visible, first * stride, stride, view, third, sh, bands, bands_of, block)
             finite = clamp_colors(view, block)

@@ -37,7 +37,7 @@ def project_back(start, stop, flags, view, splats, table, firsts, tile_grads, gr
 
     Splat i's tiles have the rows firsts[i]..firsts[i + 1] of tile_grads.
     """
-    covariances, integrated, reshaped, _, fourth = flags
+    covariances, integrated, reshaped, _, fourth, third = flags
     stride = 3 * splats.sh.shape[1]
     colors = pointer(splats.sh), pointer(grads.sh), pointer(table), stride, len(grads.sh) > 0, start
     arrays, targets, tile_rows = pointers(splats), pointers(grads), pointer(tile_grads)
@@ -56,7 +56,7 @@ def project_back(start, stop, flags, view, splats, table, firsts, tile_grads, gr
                     load_splat(rows[lane], lane, arrays, covariances, world)
             for part in range(0, size, PART):
                 grad_splats(view, covariances, integrated, reshaped, beyond(world, part), beyond(sums, part), beyond(d_world, part))
-            grad_colors(view, fourth, rows, size, world, sums, colors, spaces, d_world)
+            grad_colors(view, fourth, third, rows, size, world, sums, colors, spaces, d_world)
             if in_a_row:
                 add_grads(rows[0] - start, d_world, targets)
             else:

@@ -19,6 +19,7 @@ class Flags(NamedTuple):
     reshaped: bool | None  # culled, stretched or shrunk
     faded: bool | None  # they fade to 0 before they end
     fourth: bool | None  # their colors have harmonics of degree 4
+    third: bool | None  # they have those of degree 3, and no others: 16 bands, as many as a vector has lanes
 
 
 class View(NamedTuple):
