@@ -147,8 +147,9 @@ def _with_dc(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
 
 
 def has_bright_colors(columns: Mapping[str, np.ndarray]) -> bool:
-    """Whether the colors red, green and blue are floats in 0..255."""
-    return any((columns[name] > BRIGHTEST).any() for name in RGB if name in columns and columns[name].dtype.kind == "f")
+    """Whether the colors, red, green and blue in place of harmonics, are floats in 0..255."""
+    colors = [columns[name] for name in RGB if name in columns and DC[0] not in columns]
+    return any((np.isfinite(each) & (each > BRIGHTEST)).any() for each in colors if each.dtype.kind == "f")
 
 
 def _with_logits(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:

@@ -7,7 +7,16 @@ from pathlib import Path
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import recorded_filter, render_mode
-from mipmap_plugin.models.columns import FILTER_3D, extra_columns, holds_halves, notes_on, second_colors, whole_opacities
+from mipmap_plugin.models.columns import (
+    BRIGHTEST,
+    FILTER_3D,
+    extra_columns,
+    has_bright_colors,
+    holds_halves,
+    notes_on,
+    second_colors,
+    whole_opacities,
+)
 from mipmap_plugin.models.detect import Checkpoint, detect_as
 from mipmap_plugin.models.exposure import read_exposures
 from mipmap_plugin.models.health import without_invalid
@@ -38,6 +47,7 @@ def read_splats(checkpoint: Checkpoint, kind: type[Model]) -> Model:
     model = kind(parameters, trained, origin, [*checkpoint.notes, *ply.notes, *notes])
     model.notes += [f"its opacities are whole numbers ({whole}), read as fractions of the largest"] if (whole := whole_opacities(ply.columns)) else []
     model.notes += ["its columns have 16 bits, read as half-precision floats"] if holds_halves(ply.columns) else []
+    model.notes += [f"its colors are floats above {BRIGHTEST}, read as numbers in 0..255"] if has_bright_colors(ply.columns) else []
     model.notes += second_colors(ply.columns)
     del ply  # as large as the model, and no longer needed
     has_filter = FILTER_3D in extras  # whose family knows its screen filter

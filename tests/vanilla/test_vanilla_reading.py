@@ -87,7 +87,14 @@ def test_rgb_stands_in_for_dc(tmp_path, full):
     model = load_vanilla(write(tmp_path / "a.ply", {**columns, **colors}))
     rendered_colors = 0.5 + 0.28209479177387814 * model.gaussians().sh[:, 0]
     torch.testing.assert_close(rendered_colors, torch.tensor([[1.0] * 3, [0.0] * 3]))
-    assert not model.notes
+    assert model.notes == ["its colors are floats above 16, read as numbers in 0..255"] * bool(full == 255 and full.dtype == np.float32)
+
+
+def test_an_infinite_color_does_not_make_all_colors_numbers_up_to_255(tmp_path):
+    columns = {name: column for name, column in splat_columns(2, 0).items() if not name.startswith("f_dc")}
+    colors = {name: np.array([np.inf, 0.5], np.float32) for name in ("red", "green", "blue")}
+    model = load_vanilla(write(tmp_path / "a.ply", {**columns, **colors}))
+    assert model.gaussians().sh[-1, 0].abs().max() < 1e-6
 
 
 def test_refuses_other_f_rest_counts_and_missing_columns(tmp_path):
