@@ -237,6 +237,26 @@ def test_broken_models_are_refused_in_one_sentence(tmp_path):
         load_scene(tmp_path / "torn")
 
 
+@pytest.mark.parametrize("posed", [True, False])
+def test_rigs_of_several_cameras_are_read(tmp_path, posed):
+    """COLMAP has them since version 3.12: the pose of a rig's further cameras is in the file where it is known."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 2, 3, 2, 5
+    model = pycolmap.synthesize_dataset(options)
+    if not posed:  # and no image was taken by it
+        model.add_camera(pycolmap.Camera(camera_id=999, model="PINHOLE", width=64, height=48, params=[70, 72, 31, 25]))
+        model.rigs[1].add_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, 999), None)
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    model.write_binary(tmp_path / "sparse/0")
+    poses = {image.name.removesuffix(".png"): image.cam_from_world().matrix() for image in model.images.values()}
+    cameras = {camera.name: camera.viewmat[:3].numpy() for camera in load_scene(tmp_path).cameras}
+    assert len(cameras) == 12 and all(np.allclose(cameras[name], pose) for name, pose in poses.items())
+    rigs = tmp_path / "sparse/0/rigs.bin"
+    rigs.write_bytes(rigs.read_bytes()[:-1])
+    with pytest.raises(SceneError, match=r"rigs\.bin: is truncated or damaged"):
+        load_scene(tmp_path)
+
+
 def test_what_is_no_perspective_camera_or_has_no_name_is_refused_in_one_sentence(tmp_path):
     """COLMAP 4 has panoramas, whose model has no focal length."""
     write_text_model(tmp_path / "round/sparse/0", ["a.png"], "EQUIRECTANGULAR", "64 48")
