@@ -208,7 +208,7 @@ def _validation_views(
     kept: list[Camera] = []
     if config.views in ("train", "jittered"):
         kept = evenly(originals[VALIDATION_EVERY // 2 :], min(count // 2, len(originals) // VALIDATION_EVERY))
-    adapted = [view for view in views if view not in set(kept)]
+    adapted = [view for view in views if view not in kept]
     known = with_company(originals or list(views), viewpoints.orbit)
     random = jittered(known, count - len(kept), generator, spread=False)
     return adapted, [view for pair in zip(random, kept, strict=False) for view in pair] + random[len(kept) :]
