@@ -217,6 +217,12 @@ def test_a_lens_that_bends_becomes_a_pinhole_with_a_note(tmp_path, model, params
     assert any(model in note and "undistorted" in note for note in scene.notes)
 
 
+@pytest.mark.parametrize(("count", "told"), [(1, "1 camera has a lens that bends (SIMPLE_RADIAL): it "), (2, "2 cameras have lenses that bend (")])
+def test_a_note_says_how_many_lenses_bend(tmp_path, count, told):
+    write_text_model(tmp_path / "sparse/0", names(count), "SIMPLE_RADIAL", "70 31 25 0.1")
+    assert any(note.startswith(told) for note in load_scene(tmp_path).notes)
+
+
 def test_a_lens_model_whose_distortion_is_zero_is_a_pinhole(tmp_path):
     write_text_model(tmp_path / "sparse/0", names(1), "SIMPLE_RADIAL", "70 31 25 0")
     camera = load_scene(tmp_path).cameras[0]
