@@ -217,6 +217,12 @@ def test_a_lens_that_bends_becomes_a_pinhole_with_a_note(tmp_path, model, params
     assert any(model in note and "undistorted" in note for note in scene.notes)
 
 
+@pytest.mark.parametrize(("count", "told"), [(1, "1 camera has a lens that bends (SIMPLE_RADIAL): it "), (2, "2 cameras have lenses that bend (")])
+def test_a_note_says_how_many_lenses_bend(tmp_path, count, told):
+    write_text_model(tmp_path / "sparse/0", names(count), "SIMPLE_RADIAL", "70 31 25 0.1")
+    assert any(note.startswith(told) for note in load_scene(tmp_path).notes)
+
+
 def test_a_lens_model_whose_distortion_is_zero_is_a_pinhole(tmp_path):
     write_text_model(tmp_path / "sparse/0", names(1), "SIMPLE_RADIAL", "70 31 25 0")
     camera = load_scene(tmp_path).cameras[0]
@@ -235,6 +241,26 @@ def test_broken_models_are_refused_in_one_sentence(tmp_path):
         (tmp_path / f"torn/sparse/0/{name}.bin").write_bytes(b"\1\2\3")
     with pytest.raises(SceneError, match="is truncated or damaged, for it is shorter than its own counts say"):
         load_scene(tmp_path / "torn")
+
+
+@pytest.mark.parametrize("posed", [True, False])
+def test_rigs_of_several_cameras_are_read(tmp_path, posed):
+    """COLMAP has them since version 3.12: the pose of a rig's further cameras is in the file where it is known."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 2, 3, 2, 5
+    model = pycolmap.synthesize_dataset(options)
+    if not posed:  # and no image was taken by it
+        model.add_camera(pycolmap.Camera(camera_id=999, model="PINHOLE", width=64, height=48, params=[70, 72, 31, 25]))
+        model.rigs[1].add_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, 999), None)
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    model.write_binary(tmp_path / "sparse/0")
+    poses = {image.name.removesuffix(".png"): image.cam_from_world().matrix() for image in model.images.values()}
+    cameras = {camera.name: camera.viewmat[:3].numpy() for camera in load_scene(tmp_path).cameras}
+    assert len(cameras) == 12 and all(np.allclose(cameras[name], pose) for name, pose in poses.items())
+    rigs = tmp_path / "sparse/0/rigs.bin"
+    rigs.write_bytes(rigs.read_bytes()[:-1])
+    with pytest.raises(SceneError, match=r"rigs\.bin: is truncated or damaged"):
+        load_scene(tmp_path)
 
 
 def test_what_is_no_perspective_camera_or_has_no_name_is_refused_in_one_sentence(tmp_path):

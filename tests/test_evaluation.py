@@ -10,7 +10,9 @@ import tiny
 import torch
 from PIL import Image
 
+from mipmap_plugin.adaptation.target.photographs import at_density_of
 from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation import measure, photographs, protocols
 from mipmap_plugin.evaluation.evaluate import Evaluator, Row, all_rows, evaluator_of, means, training_free_rows
@@ -138,6 +140,17 @@ def test_a_truth_finer_than_the_photograph_is_refused():
     view = protocols.TestView(tiny.cameras(1)[0], noise(24, 32, 3), Path("photograph.png"))
     with pytest.raises(SettingsError, match="x2 needs 64 x 48 px, but the photographs have only 32 x 24; evaluate a smaller scale"):
         view.truth(2, PROTOCOLS["P3"])
+
+
+@pytest.mark.parametrize(("size", "divisor"), [((3286, 4946), 8), ((3361, 5187), 2), ((2078, 3118), 4), ((5992, 4004), 8)])
+def test_a_photograph_is_large_enough_for_a_base_whose_size_was_rounded_up(size, divisor):
+    """Captures of mip-NeRF 360, trained at half, a quarter and an eighth of their size, as in the tables of zoom-in."""
+    height, width = size
+    full = Camera(width, height, 4000.0, 4000.0, width / 2, height / 2, torch.eye(4), "view", "test")
+    base = full.resized(round(width / divisor), round(height / divisor))
+    [camera] = at_density_of([full], [base])
+    view = protocols.TestView(camera, torch.zeros(*size, 3), Path("photograph.png"))
+    assert view.truth(divisor, PROTOCOLS["P3"]).shape[:2] == camera.zoomed(divisor).size
 
 
 @pytest.fixture

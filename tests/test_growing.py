@@ -93,6 +93,14 @@ def test_a_growth_is_judged_when_the_run_ends(judged, ending):
     assert "growth was undone at step" in run.report.ended_by
 
 
+def test_the_curve_ends_with_the_state_that_is_left_when_a_growth_is_undone(judged):
+    """The check that ends the run, with the growth of its step, comes before that is judged."""
+    judged(30.0, 10.0)
+    ending = dict(target_db=1.0, check_every=2)
+    undone, ungrown = (adapted(**ending, **grows).report.curve[-1] for grows in ({}, dict(densify_gradient=1e9)))
+    assert (undone.step, undone.gaussians, undone.validation_db) == (2, len(tiny.model()), ungrown.validation_db)
+
+
 def test_what_is_no_number_is_undone(judged):
     judged(30.0, math.nan)
     assert adapted().report.gaussians_after == len(tiny.model())

@@ -190,6 +190,18 @@ def test_nerfstudio_orders_the_images_of_colmap_by_their_numbers(tmp_path, optio
     assert [camera.name for camera in found] == [names[number] for number in sorted(tests)]
 
 
+@pytest.mark.parametrize("names", [["b/0.png", "b/1.png", "a/1.png", "a/0.png"], ["b/0.png", "./b/2.png", "a/3.png", "a/1.png"]])
+def test_nerfstudio_orders_frames_by_their_paths(tmp_path, names):
+    """data/dataparsers/nerfstudio_dataparser.py: of the cameras of a rig, whose files have the same names or not, one after the other."""
+    frames = [{"file_path": name, "transform_matrix": [[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0]]} for x, name in enumerate(names)]
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 60.0, "w": 64, "h": 48, "frames": frames}))
+    of_nerfstudio(tmp_path / "r")
+    config = tmp_path / "r/config.yml"
+    config.write_text(config.read_text() + "eval_mode: interval\neval_interval: 2\n")
+    found = placed(load_model(tmp_path / "r"), load_scene(tmp_path)).split("test")
+    assert sorted(camera.center[0].item() for camera in found) == [0, names.index(sorted(names[2:])[0])]
+
+
 @pytest.mark.parametrize(("options", "width"), [({"ds": 8, "fork": 2, "resolution": -1}, 618), ({"ds": 1, "fork": 2}, 4946), ({"ds": 8}, 4946)])
 def test_octree_gs_trains_on_the_folder_that_ds_names(tmp_path, options, width):
     """scene/dataset_readers.py of Octree-GS; the option of the same name in Scaffold-GS changes nothing there."""

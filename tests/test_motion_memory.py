@@ -41,6 +41,15 @@ def at_times(count):
     return [replace(view, time=number / (count - 1)) for number, view in enumerate(tiny.cameras(count))]
 
 
+@pytest.mark.parametrize("write", [moving.write_deformable, moving.write_hexplane])
+def test_rows_come_out_the_same_among_any_others(tmp_path, write):
+    """What is kept of splats that a pruning leaves is what a resumed run evaluates anew; products of one to three rows are rounded otherwise."""
+    field = load_model(write(tmp_path / "m")).field
+    means = torch.randn(memory.CHUNK + 1, 3, generator=torch.Generator().manual_seed(0))
+    whole, left = (Memory(field.changes)(some, 0.4) for some in (means, means[1:]))
+    assert all(torch.equal(changes[1:], left[name]) for name, changes in whole.items())
+
+
 @pytest.mark.parametrize("write", [moving.write_deformable, lambda folder: moving.write_hexplane(folder, ALL_ON)])
 def test_what_is_kept_shows_what_an_evaluation_shows(tmp_path, write):
     model = load_model(write(tmp_path / "m"))
@@ -133,7 +142,7 @@ def test_many_splats_are_evaluated_in_parts(monkeypatch):
     monkeypatch.setattr(memory, "CHUNK", 4)
     known, asked = counted_memory()
     means = torch.arange(30.0).reshape(10, 3)
-    assert torch.equal(known(means, 0.5)["means"], means / 2) and [count for count, _ in asked] == [4, 4, 2]
+    assert torch.equal(known(means, 0.5)["means"], means / 2) and [count for count, _ in asked] == [4, 3, 3]
 
 
 def test_a_followed_model_moves_its_splats_as_before_until_they_are_far_off(tmp_path):
@@ -262,5 +271,4 @@ def test_a_resumed_run_comes_to_the_same(tmp_path):
         patch.setattr(resume, "SAVE_EVERY_S", 0.0)
         wrap_model(folder).adapt(1 / 2, resume=state, observe=interrupt, **settings)
     resumed = wrap_model(folder).adapt(1 / 2, resume=state, **settings).model.parameters()
-    for name, tensor in whole.items():
-        torch.testing.assert_close(resumed[name], tensor, rtol=1e-4, atol=1e-4)
+    assert all(torch.equal(resumed[name], tensor) for name, tensor in whole.items())

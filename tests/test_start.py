@@ -1,5 +1,6 @@
 """The start: the best of base, closed form and merged splats, as validation views have it."""
 
+import weakref
 from dataclasses import replace
 
 import pytest
@@ -33,6 +34,21 @@ def adapted(count=COUNT, scale=SCALE, **settings):
 
 def start_of(report) -> str:
     return next(name for name in report.validation if name.startswith("the start, ")).removeprefix("the start, ")
+
+
+def test_what_a_start_was_searched_with_is_gone_during_the_steps(monkeypatch):
+    """The pairs of all rounds of merging, for one."""
+    found = list[weakref.ref[candidates.Rounds]]()
+
+    class Kept(candidates.Rounds):
+        def __init__(self):
+            super().__init__()
+            found.append(weakref.ref(self))
+
+    monkeypatch.setattr(candidates, "Rounds", Kept)
+    left = list[bool]()
+    adapted(steps=2, merge_to=0.5, observe=lambda *_: left.append(any(rounds() for rounds in found)))
+    assert found and left and not any(left)
 
 
 def test_the_closed_form_is_where_a_run_starts():

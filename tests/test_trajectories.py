@@ -251,12 +251,12 @@ def test_jittered_is_the_same_only_for_the_same_seed():
 
 
 def test_views_around_thousands_of_cameras_need_no_number_for_each_pair(monkeypatch):
-    """Of 10,000 cameras such tensors took 3 GB."""
+    """Of 10,000 cameras such tensors took 3 GB, and one of them to each candidate for 1000 views 1.3 GB."""
     cameras, before = ring(100), jittered(ring(100), 5, seeded())
     monkeypatch.setattr("mipmap_plugin.scenes.trajectories.BLOCK", 7)
     with Largest() as largest:
         views = jittered(cameras, 5, seeded())
-    assert largest.numbers <= 5 * CANDIDATES * 100 and torch.equal(poses(views), poses(before))
+    assert largest.numbers < 2000 < 5 * CANDIDATES * 100 and torch.equal(poses(views), poses(before))
 
 
 def test_a_single_camera_is_rotated_in_place():

@@ -123,6 +123,7 @@ class Session:
         search = StartSearch(self._start_problem())
         initial, start = search.best()
         self.notes = [note for note in search.notes if note == UNMATCHED or not (self.finer and self.finer.told)]
+        del search  # with the pairs of all rounds of merging
         states = {AS_IT_IS: self._for_target(self.request.base_in_viewer, shared=True), f"the start, {start}": initial}
         curve: list[CurvePoint] = []
         ended_by = "0 steps" + fewer_note(self.asked.steps, self.config.model_copy(update={"steps": 0}))
@@ -215,9 +216,8 @@ class Session:
         self.seconds["validation"] = self.seconds.get("validation", 0.0) + checks
         self.seconds["optimization"] = run.watch.seconds - self.seconds["total"] - run.costs.seconds()
         self.seconds["total"] = run.watch.seconds
-        share = self.request.budget_share
+        share, self.ended = self.request.budget_share, run.ended_by
         self.notes = [*self.notes, *(no_steps_notes(run, self.config, share) if self.wanted is None else [])]
-        self.ended = run.ended_by
         told = run.ended_by.told(self.config, run.step, share)
         return run, told + (plan_note(run, self.config) or fewer_note(self.asked.steps, self.config)) + growth_note(run)
 

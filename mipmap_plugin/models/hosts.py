@@ -19,7 +19,7 @@ class Capture:
     points: Tensor | None = None  # [P, 3] of structure from motion
     smaller: Callable[[int], tuple[int, int] | None] | None = None  # (width, height) px of the copies in images_<factor>; None: no photographs
     applied_scale: float = 1.0  # scale that nerfstudio applied to COLMAP's world before it wrote the file
-    numbers: Sequence[int] = ()  # COLMAP's, of the cameras' images
+    numbers: Sequence[int] = ()  # of the cameras' images (`scenes.Scene`)
 
 
 class Host(Protocol):

@@ -89,10 +89,10 @@ class SplatfactoHost:
         """
         names = [camera.name for camera in cameras]
         said = any(camera.split == "test" for camera in cameras) if capture.points is None else "eval_mode" not in self.options
-        if not said and len(set(names)) == len(names):
-            by_number = capture.numbers if OF_COLMAP in self.options else ()
-            ordered = [name for _, name in sorted(zip(by_number, names, strict=True))] if by_number else sorted(names, key=as_file)
-            cameras = held_out(cameras, _tests(ordered, self.options), by_number)
+        numbers = capture.numbers if capture.points is None or OF_COLMAP in self.options else ()
+        if not said and (numbers or len(set(names)) == len(names)):
+            ordered = [name for _, name in sorted(zip(numbers, names, strict=True))] if numbers else sorted(names, key=as_file)
+            cameras = held_out(cameras, _tests(ordered, self.options), numbers)
         frame = self._frame()
         frame[:3] /= capture.applied_scale  # contained in the file's scale, but already applied to the poses
         factor = _factor(cameras, self.options.get("downscale_factor"), capture)

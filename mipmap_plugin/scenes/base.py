@@ -40,7 +40,7 @@ class Scene:
         applied: [4, 4] float64, transform that nerfstudio applied to COLMAP's world before it wrote the file.
         applied_scale: The scale that it applied then.
         lenses: Of photographs that have to be undistorted.
-        numbers: COLMAP's numbers of the cameras' images, in whatever order they were found; () elsewhere.
+        numbers: By which a training may order the cameras' images: COLMAP's numbers, or the order of the paths in transforms files; () elsewhere.
         as_4dgaussians: It is a capture that Deformable 3D Gaussians, too, is trained on, but was read as 4DGaussians does (`scenes.moving`).
     """
 

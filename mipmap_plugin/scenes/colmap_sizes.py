@@ -18,13 +18,14 @@ class Rows:
     has_name: bool = False  # whether a zero-terminated text follows
     count: str = ""  # struct format of the length of the row's list; empty: there is no list
     each: int = 0  # size of an item of the list
+    optional: int = 0  # size of what an item has after it, but for the first, if the byte between them is not 0
 
 
 FILES = {
     "cameras.bin": Rows(24),  # followed by parameters, whose number depends on the camera model
     "images.bin": Rows(64, has_name=True, count="<Q", each=24),
     "points3D.bin": Rows(43, count="<Q", each=8),
-    "rigs.bin": Rows(4, count="<I", each=8),
+    "rigs.bin": Rows(4, count="<I", each=8, optional=56),  # the poses of sensors, in that of the first
     "frames.bin": Rows(64, count="<I", each=16),
 }
 
@@ -58,5 +59,15 @@ def _end(content: mmap.mmap, rows: Rows, declared: int) -> int:
             at = content.find(b"\0", at) + 1 or beyond
         if at + length.size > len(content):
             return beyond
-        at += length.size + rows.each * length.unpack_from(content, at)[0]
+        (items,) = length.unpack_from(content, at)
+        at += length.size
+        if not rows.optional:
+            at += rows.each * items
+            continue
+        at += rows.each * min(1, items)
+        for _ in range(items - 1):
+            at += rows.each
+            if at >= len(content):
+                return beyond
+            at += 1 + rows.optional * bool(content[at])
     return at

@@ -64,6 +64,8 @@ class Lens:
 def note(lenses: Collection[Lens]) -> str:
     """A note that the images of cameras with these lenses are undistorted."""
     models = ", ".join(sorted({lens.model for lens in lenses}))
+    if len(lenses) == 1:
+        return f"1 camera has a lens that bends ({models}): it is taken as a pinhole, and its photograph is undistorted to be looked at"
     bent = f"{len(lenses)} cameras have lenses that bend ({models})"
     return f"{bent}: they are taken as pinholes, and their photographs are undistorted to be looked at"
 

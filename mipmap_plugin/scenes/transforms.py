@@ -51,11 +51,12 @@ def read_transforms(path: str | Path, cfg: dict[str, Any] | None = None) -> Scen
     """
     path = Path(path)
     views: list[View] = []
+    places: list[PurePosixPath] = []
     notes: list[str] = []
     files = transforms_files(path)
     for file, split in files:
-        found, absent = _read_file(file, split)
-        views += found
+        found, listed, absent = _read_file(file, split)
+        views, places = views + found, places + listed
         if absent:
             unsized = absent - sum(image is None for _, image, _ in found)
             notes.append(f"{file.name}: {_counted(absent)} {ABSENT}{_left_out(unsized)}")
@@ -68,7 +69,9 @@ def read_transforms(path: str | Path, cfg: dict[str, Any] | None = None) -> Scen
     lenses = {image: lens for _, image, lens in views if image and lens}
     notes += [note(distorted) + ("" if can_undistort() else f"; pycolmap does that: {INSTALL}")] if distorted else []
     applied, applied_scale = _applied(files[0][0])
-    return Scene(cameras, images, path, notes, applied=applied, applied_scale=applied_scale, lenses=lenses)
+    number_of = {place: number for number, place in enumerate(sorted(places))}
+    numbers = tuple(number_of[place] for place in places)
+    return Scene(cameras, images, path, notes, applied=applied, applied_scale=applied_scale, lenses=lenses, numbers=numbers)
 
 
 def transforms_files(path: Path) -> list[tuple[Path, Literal["train", "test"]]]:
@@ -124,14 +127,15 @@ def _left_out(unsized: int) -> str:
     return f"; {cameras} left out because the file has no w and h"
 
 
-def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View], int]:
-    """The usable views, and the number of listed images that are missing."""
+def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View], list[PurePosixPath], int]:
+    """The usable views, the listed place of each one's image, and the number of listed images that are missing."""
     data = read_json(file)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
         lacks = "has no list of 'frames'" if frames != [] else "lists no frames"
         raise SceneError(f"{file}: {lacks}; give a NeRF-Synthetic, instant-ngp or nerfstudio transforms file")
     views: list[View] = []
+    places: list[PurePosixPath] = []
     absent, trained = 0, {_place(str(name)) for name in names} if isinstance(names := data.get("train_filenames"), list) else None
     for index, frame in enumerate(frames):
         where = f"{file}, frame {index}"
@@ -153,7 +157,8 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
             camera = _camera(values, stated or actual, name, split, f"{where} ({name})").resized(*actual)
             lens = _lens(values, model, camera, f"{where} ({name})")
             views.append((lens.straightened(camera) if lens and can_undistort() else camera, image, lens))
-    return views, absent
+            places.append(_place(listed))
+    return views, places, absent
 
 
 def _applied(file: Path) -> tuple[Tensor | None, float]:

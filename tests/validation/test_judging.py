@@ -95,6 +95,15 @@ def test_a_window_bounds_what_is_judged(scale, most):
     assert judged[0].fx == views[0].fx and judged[0].cx == pytest.approx(most / 2, abs=0.5)  # the middle
 
 
+@pytest.mark.parametrize("pixels", [3, 5, 7, 10, 1000])
+def test_a_window_has_whole_blocks_where_its_view_has(pixels):
+    """The filter `box` shrinks nothing else."""
+    views = tiny.cameras(width=2000 * pixels, height=1500 * pixels)
+    _, judged = held_back(views, "given", 1 / pixels)
+    assert judged and all(side <= WINDOW for view in judged for side in view.size)
+    assert all(side % small == 0 for view in judged for side, small in zip(view.size, view.zoomed(1 / pixels).size, strict=True))
+
+
 def test_where_one_pixel_of_the_base_is_more_than_is_judged_nothing_is():
     views = tiny.cameras()
     assert held_back(views, "given", 2 * WINDOW) == (views, [])

@@ -36,17 +36,18 @@ def control_density(run: Run, task: Task, config: AdaptConfig) -> None:
 
 
 @torch.no_grad()
-def undo_harmful_growth(run: Run, task: Task, config: AdaptConfig) -> None:
-    """Undo the last growth if it is on trial and the views are worse than at the start of the run; then stop growing."""
+def undo_harmful_growth(run: Run, task: Task, config: AdaptConfig) -> bool:
+    """Undo the last growth if it is on trial and the views are worse than at the start of the run; then stop growing. Return whether it was."""
     trial = run.trial
     if trial is None or trial.before is None:
-        return
+        return False
     if task.agreement(run.student, config) >= trial.least_db:
         run.trial = replace(trial, before=None, passed=True)
-        return
+        return False
     restore_parameters(run.student, run.optimizer, trial.before)
     run.trial = replace(trial, before=None, undone_at=run.step)
     run.gradients, run.rows_changed = None, True
+    return True
 
 
 def growth_note(run: Run) -> str:

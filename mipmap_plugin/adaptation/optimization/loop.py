@@ -74,9 +74,12 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
             if interrupted():
                 on_interrupt(run)
         with run.watch:
-            undo_harmful_growth(run, task, config)
+            undone = undo_harmful_growth(run, task, config)
             if run.curve[-1].step < run.step:
                 _check(run, task, config)
+            elif undone:  # the check of this step was of the growth
+                psnr = run.costs.check(lambda: task.validation.quality(run.student)).psnr
+                run.curve[-1] = run.curve[-1].model_copy(update={"validation_db": psnr, "gaussians": count_of(run.student, task.views[0])})
         if interrupted():
             on_interrupt(run)
     return reason or End.STEPS

@@ -6,6 +6,7 @@ The other half is used once, at the end, to choose among the base as it is, the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -43,6 +44,9 @@ MIN_VIEWS_OF_START = 8
 
 # px: validation uses at most this much of a view along each side, so that large images stay cheap.
 WINDOW = 768
+
+# Of a number of pixels that is a whole one, as of a third.
+ROUNDING = 1e-6
 
 # Added to the seed for the random views of validation, so that they differ from the views that are adapted to.
 SEED_OFFSET = 7919
@@ -183,8 +187,15 @@ def split_validation(
     if scale > WINDOW:
         return list(views), []
     adapted, validation = _validation_views(cameras, views, viewpoints, config)
-    size = round(WINDOW / max(1.0, scale))
+    size = _window_side(scale)
     return adapted, [view.window(size, size) for view in validation]
+
+
+def _window_side(scale: float) -> int:
+    """px of the base: at a zoom-out those of whole pixels of the new scale, which a filter of whole blocks (`box`) needs."""
+    if scale >= 1:
+        return round(WINDOW / scale)
+    return min(WINDOW, round(max(1, math.floor(WINDOW * scale + ROUNDING)) / scale))
 
 
 def count_of_views(config: AdaptConfig) -> int:
@@ -208,7 +219,7 @@ def _validation_views(
     kept: list[Camera] = []
     if config.views in ("train", "jittered"):
         kept = evenly(originals[VALIDATION_EVERY // 2 :], min(count // 2, len(originals) // VALIDATION_EVERY))
-    adapted = [view for view in views if view not in set(kept)]
+    adapted = [view for view in views if view not in kept]
     known = with_company(originals or list(views), viewpoints.orbit)
     random = jittered(known, count - len(kept), generator, spread=False)
     return adapted, [view for pair in zip(random, kept, strict=False) for view in pair] + random[len(kept) :]

@@ -109,5 +109,5 @@ def _held_out(model: Wrapped) -> tuple[list[Camera], list[Camera]]:
 
 def _others(cameras: list[Camera], judged: Sequence[Camera]) -> list[Camera]:
     """The cameras that are not among the `judged` views."""
-    seen = views_seen(cameras, judged)
+    seen = {*views_seen(cameras, judged)}
     return [camera for camera in cameras if camera not in seen]

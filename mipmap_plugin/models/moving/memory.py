@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 
@@ -63,7 +64,9 @@ class Memory:
     @torch.no_grad()
     def evaluate(self, means: Tensor, time: float) -> Changes:
         """The changes at `means` [N, 3], evaluated chunk by chunk; on a processor in all threads that views share."""
-        chunks = means.detach().split(CHUNK if means.device.type == "cpu" else CHUNK_OF_GPU)
+        most = CHUNK if means.device.type == "cpu" else CHUNK_OF_GPU
+        # Of equal sizes: one row, two or three of a rest come out otherwise, in the last digit, than among others, as after a pruning.
+        chunks = means.detach().tensor_split(max(1, math.ceil(len(means) / most)))
         parts = list(side_by_side(lambda part: self._evaluate(part, time), chunks, for_views()))
         return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
