@@ -31,12 +31,18 @@ ROWS = 4096
 
 
 def codebook(values: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """256 ascending numbers, and the index of the one that each of the `values` is rounded to, uint8 in their shape. `weights`: of that shape."""
+    """256 ascending numbers, and the index of the one that each of the `values` is rounded to, uint8 in their shape. `weights`: of that shape.
+
+    Fewer distinct numbers have several codes each, and the index is the one in the middle: Babylon.js decodes images on a canvas, which changes the
+    colors of half-transparent pixels, and these are indices, by a few levels.
+    """
     flat, shares = values.astype(np.float64).ravel(), weights.astype(np.float64).ravel()
     distinct = np.unique(flat)
     codes = distinct if len(distinct) <= CODES else _moved(_placed(flat, shares), flat, shares)
-    labels = np.searchsorted((codes[1:] + codes[:-1]) / 2, flat).astype(np.uint8)
-    return np.pad(codes, (0, CODES - len(codes)), mode="edge"), labels.reshape(values.shape)
+    entries = np.searchsorted((codes[1:] + codes[:-1]) / 2, flat)
+    owners = np.arange(CODES) * len(codes) // CODES
+    middles = (np.searchsorted(owners, np.arange(len(codes))) + np.searchsorted(owners, np.arange(len(codes)), "right") - 1) // 2
+    return codes[owners], middles[entries].astype(np.uint8).reshape(values.shape)
 
 
 def _placed(values: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -98,6 +98,19 @@ def test_few_splats_and_equal_ones_are_kept_as_they_are(tmp_path, count):
     assert np.allclose(found["quats"], [[1, 0, 0, 0]], atol=0.01)
 
 
+@pytest.mark.parametrize("different", [1, 3, 20])
+def test_colors_of_which_there_are_few_survive_a_canvas(tmp_path, different):
+    """Babylon.js decodes images on one, which keeps a color times its opacity, in 8 bits: of few splats, or of equal ones, colors were wrong."""
+    columns = columns_of(60, degree=0)
+    columns |= {f"f_dc_{i}": np.resize(columns[f"f_dc_{i}"][:different], 60) for i in range(3)} | {"opacity": np.linspace(-1, 5, 60)}
+    write_sog(tmp_path / "a.sog", columns, antialiased=False)
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        pixels, codes = as_rgba(archive.read("sh0.webp")).reshape(-1, 4)[:60], np.array(json.loads(archive.read("meta.json"))["sh0"]["codebook"])
+    colors, alphas = pixels[:, :3], pixels[:, 3:]
+    kept = np.minimum(np.rint(np.rint(colors * alphas / 255) * 255 / alphas), 255).astype(int)
+    assert (kept != colors).any() and np.array_equal(codes[kept], codes[colors])
+
+
 @pytest.mark.parametrize("packed", [True, False])
 @pytest.mark.parametrize("told", [{"palette_size": 40}, {}])
 def test_a_table_that_does_not_say_how_many_entries_it_has_is_told_of(tmp_path, tool, packed, told):
