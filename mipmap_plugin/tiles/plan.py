@@ -17,12 +17,10 @@ from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.models.adapted_scale import refuse_adapted
 from mipmap_plugin.models.outputs import parts_of
+from mipmap_plugin.models.places import PLAN
 from mipmap_plugin.splatting.viewers import viewers_for
 from mipmap_plugin.tiles.folder import BASE, CUT, work_folder
 from mipmap_plugin.tiles.reading import find_splats, make_cut
-
-# What the folder's tiles belong to.
-PLAN = "plan.json"
 
 # Of the folder's files: those of another format are not gone on with.
 FORMAT = 5
