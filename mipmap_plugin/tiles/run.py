@@ -119,7 +119,7 @@ def _adapted_and_saved(scene: TiledScene, stages: _Stages, began: float, threads
     stages.seconds["total"] = time.perf_counter() - began
     with announced(f"writing {stages.job.target.name}"):
         files = _write_parts(scene, returned)
-        report = make_report(scene, files, stages.seconds, validation, returned)
+        report = make_report(scene, files, facts, stages.seconds, validation, returned)
         saved = _save(scene, stages.job, files, Joined(stages.job.target, report, facts))
     close_opened()
     shutil.rmtree(scene.folder)

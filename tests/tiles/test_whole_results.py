@@ -61,6 +61,22 @@ def test_a_large_scene_takes_fewer_steps_in_tiles_too(job, monkeypatch):
     assert report.ended_by.startswith("2 tiles of 4 steps (of 16, because the scene is large")
 
 
+@pytest.mark.parametrize(
+    ("settings", "ended_by", "step"),
+    [
+        ({}, "2 tiles of 4 steps", 4),
+        ({"target_db": 1.0, "warm_up": 0.5}, "target of 1 dB against the pseudo truth, 2 tiles of 2 steps", 2),
+        ({"time_budget_s": 1e-6}, "time budget of 1e-06 s, 2 tiles of 1 steps at most", 1),
+        ({"steps": 0}, "2 tiles of 0 steps", 0),
+    ],
+)
+def test_the_report_says_why_the_run_ended(job, settings, ended_by, step):
+    joined = adapt_in_tiles(replace(job, settings=job.settings | settings), 2)
+    assert (joined.report.ended_by, joined.report.curve[-1].step) == (ended_by, step)
+    if not settings:
+        assert {tile["ended_by"] for tile in joined.tiles} == {"the end of the sweep"}
+
+
 def test_a_file_for_a_filter_that_the_tag_does_not_tell_whole_is_read_back_with_its_dilation(job):
     """The base of tiles too, as one that was converted at x1."""
     base = tiny.folder(job.target.with_name("base"), trained=TrainedScale("mip", 0.1))
