@@ -54,7 +54,7 @@ def refuse(job: Job, tiles: int) -> None:
 def alone(jobs: Sequence[Job]) -> Iterator[None]:
     """Inside, no other command works on the tiles of these jobs, or deletes them. Raises SettingsError where one does; OSError."""
     with ExitStack() as held:
-        for folder in (work_folder(job.target) for job in jobs):
+        for folder in dict.fromkeys(work_folder(job.target) for job in jobs):
             held.callback(remove_empty, missing_folders(folder.parent))
             folder.parent.mkdir(parents=True, exist_ok=True)
             place = folder.with_name(f".{folder.name}.lock")
