@@ -110,6 +110,8 @@ def test_cameras_of_each_scene(run, tmp_path):
         ("a.ply b.ply", "give --scale"),
         ("a.ply b.ply --scale 4 --bytes 2MB", "one checkpoint at a time"),
         ("a.ply b.ply --scale 4 --report", "one checkpoint at a time"),
+        ("a.ply --scale 4 --report --skip-existing", "without --tiles, --jobs, --dask, --shard, --send-files and --skip-existing"),
+        ("a.ply --jobs 2", "several checkpoints, jobs and tiles need a scale"),
         ("a.ply b.ply --scale 4 --steps -1", "setting steps"),
         ("a.ply b.ply --scale 4 --viewer nobody", "nobody"),
         ("a.ply b.ply --scale 4 --backend nobody", "there is no backend 'nobody'"),
