@@ -170,7 +170,7 @@ def test_jobs_of_several_bases_or_of_one_output_are_refused(job, tmp_path):
     ("words", "reason"),
     [
         ("a.ply b.ply --scale 1/2 --tiles 2", "--tiles cuts one checkpoint"),
-        ("a.ply --scale 1/2 --tiles 2 --report", "without tiles"),
+        ("a.ply --scale 1/2 --tiles 2 --report", "without --tiles"),
         ("a.ply --scale 1/2 --tiles 2 --dask local:2 --send-files", "leave --send-files out"),
     ],
 )
