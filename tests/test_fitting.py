@@ -63,6 +63,12 @@ def test_files_of_a_third_party_family_are_measured_under_their_own_ending():
     assert splats_within(model, 40_000, "file_x0.5.own", {}) == pytest.approx((40_000 - ARCHIVE) / ROW, rel=0.05)
 
 
+def test_a_format_that_cannot_be_written_is_told_by_the_name_that_was_given(monkeypatch):
+    monkeypatch.setattr("shutil.which", lambda *_, **__: None)
+    with pytest.raises(SettingsError, match=r"^phone\.spz: this format takes splat-transform, which is not installed"):
+        splats_within(tiny.model(), 10**6, "phone.spz", {})
+
+
 def test_what_is_written_for_a_viewer_is_measured_in_the_format_of_that(tmp_path):
     """A PLY for one that reads no glTF, which has fewer bytes for each splat."""
     base, size = tmp_path / "base.glb", 6_000

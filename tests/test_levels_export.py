@@ -338,6 +338,12 @@ def test_without_splat_transform_the_command_says_so_before_any_work(tmp_path, m
     assert not output.exists() and not (tmp_path / "base_x0.5.resume").exists()
 
 
+def test_a_canvas_without_distances_to_compute_is_refused(tmp_path, capsys):
+    words = ["levels", str(tiny.ply(tmp_path / "base.ply")), "--viewer", "playcanvas", "--output", str(tmp_path / "ladder")]
+    assert cli.main([*words, "--tiles", "--canvas", "2160"]) == 2
+    assert "--canvas is for the distances of Streamed SOG; give --streamed-sog too" in capsys.readouterr().err
+
+
 def test_levels_below_the_db_that_were_asked_for_are_named():
     levels = [{"file": "level_0.ply", "psnr_db": {"1": 40.0}}, {"file": "level_1.ply", "psnr_db": {"0.5": 31.0, "0.7": 35.0}}]
     assert _below({"least_db": 33.0, "levels": levels}) == ["level_1.ply"]

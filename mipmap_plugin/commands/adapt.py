@@ -117,9 +117,10 @@ def _refuse_for_many(given: bool, scales: Sequence[float], size: str | None, pag
     if not given:
         raise SettingsError(NO_CHECKPOINT)
     if not scales:
-        raise SettingsError("several checkpoints, and tiles, need a scale; give --scale")
+        raise SettingsError("several checkpoints, jobs and tiles need a scale; give --scale")
     if size is not None or page:
-        raise SettingsError("--bytes and --report are for one checkpoint at a time, without tiles; leave them out, or adapt them one by one")
+        jobs = "--tiles, --jobs, --dask, --shard, --send-files and --skip-existing"
+        raise SettingsError(f"--bytes and --report are for one checkpoint at a time, without {jobs}; leave out these or those")
 
 
 def _files(checkpoint: Path, output: Path | None, requests: Sequence[tuple[float, str | None]]) -> list[File]:

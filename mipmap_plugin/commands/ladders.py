@@ -34,13 +34,15 @@ class Exports:
 
     streamed_sog: bool
     tiles: bool
-    canvas: int  # px
+    canvas: int | None  # px, of Streamed SOG; None: the usual one
     title: str | None = None  # of the report page; None: no page
 
     def check(self, output: Path) -> None:
-        """Raise SettingsError for an impossible canvas, or if splat-transform is needed and not installed, or too old."""
-        if self.canvas < 1:
+        """Raise SettingsError for an impossible canvas or one of nothing, or if splat-transform is needed and not installed, or too old."""
+        if self.canvas is not None and self.canvas < 1:
             raise SettingsError(f"canvas: must be at least 1 px, got {self.canvas}")
+        if self.canvas is not None and not self.streamed_sog:
+            raise SettingsError("--canvas is for the distances of Streamed SOG; give --streamed-sog too, or leave --canvas out")
         if self.streamed_sog or self.tiles:
             refuse_exchange(output)  # where it is not installed
             refuse_exchange(output / (LOD_META if self.streamed_sog else "tiles.spz"))  # where it is too old
@@ -54,10 +56,11 @@ class Exports:
         return self._for_viewers(ladder) + page
 
     def _for_viewers(self, ladder: Path) -> list[Path]:
+        from mipmap_plugin.levels.manifest import CANVAS
         from mipmap_plugin.levels.streamed import write_streamed
         from mipmap_plugin.levels.tiles import write_tiles
 
-        return ([write_streamed(ladder, self.canvas)] if self.streamed_sog else []) + ([write_tiles(ladder)] if self.tiles else [])
+        return ([write_streamed(ladder, self.canvas or CANVAS)] if self.streamed_sog else []) + ([write_tiles(ladder)] if self.tiles else [])
 
 
 def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Exports, overwrite: bool) -> tuple[dict[str, Any], list[Path]]:

@@ -22,7 +22,7 @@ def levels(
     by: Way = "auto",
     streamed_sog: bool = False,
     tiles: bool = False,
-    canvas: int = 1080,
+    canvas: int | None = None,
     recipe: str = "default",
     views: ViewPolicy | None = None,
     cameras: Cameras = None,
@@ -51,7 +51,7 @@ def levels(
             a viewer and a scene with a background far behind its foreground.
         streamed_sog: Also write Streamed SOG for PlayCanvas, SuperSplat and Babylon.js, through splat-transform, with the distances to set there.
         tiles: Also write 3D Tiles for Cesium, through splat-transform.
-        canvas: Shorter side in px of the canvas that the distances of Streamed SOG are computed for.
+        canvas: With streamed_sog: the shorter side in px of the canvas that its distances are computed for; by default 1080.
         recipe: default, thorough (more steps and views), instant (no optimization), or a registered one.
         views: Which views to adapt to; by default those of the recipe.
         steps: Maximum number of optimizer steps for each level.

@@ -60,9 +60,11 @@ class AdaptationPage:
 
     def __init__(self, checkpoint: Path, targets: Sequence[Path], overwrite: bool) -> None:
         """Raises now the errors that writing the page would raise: OutputExists and OutputError."""
+        from mipmap_plugin.models.places import PAGE_ENDING
+
         name = checkpoint.resolve().name
         folder = targets[0].resolve().parent
-        self.path = folder / f"{targets[0].resolve().name if len(targets) == 1 else f'{name}_adapted'}.report.html"
+        self.path = folder / f"{targets[0].resolve().name if len(targets) == 1 else f'{name}_adapted'}{PAGE_ENDING}"
         self._title, self._overwrite, self._zooms = name, overwrite, list[Any]()
         refuse_output(self.path, overwrite, is_file=True)
         refuse_unwritable(self.path)

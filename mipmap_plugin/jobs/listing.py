@@ -58,9 +58,9 @@ def without_outputs(checkpoints: Iterable[Path]) -> tuple[list[Path], list[Path]
 def _is_output(path: Path) -> bool:
     from mipmap_plugin.models import detect
     from mipmap_plugin.models.outputs import is_adapted
-    from mipmap_plugin.models.places import MANIFEST
+    from mipmap_plugin.models.places import MANIFEST, PAGE_ENDING, PLAN, TILES
 
-    if is_adapted(path) or (path / MANIFEST).is_file():
+    if is_adapted(path) or path.name.endswith(PAGE_ENDING) or (path / MANIFEST).is_file() or (path.name.endswith(TILES) and (path / PLAN).is_file()):
         return True
     try:
         return path.is_dir() and is_adapted(detect(path).path)

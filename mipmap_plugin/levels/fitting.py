@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.adaptation.report import provenance, versions
-from mipmap_plugin.errors import TEMPORARY, SettingsError
+from mipmap_plugin.errors import TEMPORARY, MipmapPluginError, SettingsError
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import WRITTEN
 from mipmap_plugin.frozen_base import FrozenBase
@@ -76,7 +76,10 @@ def splats_within(model: SplatModel, size: int, name: str, record: dict[str, Any
     ending = next((each for each in ENDINGS if name.lower().endswith(each)), "")
     with tempfile.TemporaryDirectory(prefix=TEMPORARY) as folder:
         every = Path(folder, f"all{ending}" if ending else f"all_{name}")  # a third-party family may know its files by their ending
-        own = contract.save(for_loader_of(record.get("viewer"), model, every), every, record)
+        try:
+            own = contract.save(for_loader_of(record.get("viewer"), model, every), every, record)
+        except MipmapPluginError as error:
+            raise type(error)(str(error).replace(str(every), name)) from error
         besides, all_of_them = read_header(own).body if own.suffix == ".ply" else 0, own.stat().st_size
     if own.suffix == ".ply":
         fitting = (size - besides - UNKNOWN) * count // (all_of_them - besides)

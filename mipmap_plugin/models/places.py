@@ -20,6 +20,9 @@ REPORT = ".adaptation.json"
 # What is appended to it for the state of an unfinished run, and to that for the state of the conversion before the run.
 STATE, CONVERTED = ".resume", ".x1"
 
+# The same for the page that shows what came out, and for the folder of unfinished tiles, with what says in it what they belong to.
+PAGE_ENDING, TILES, PLAN = ".report.html", ".tiles", "plan.json"
+
 # What lies in the folder of a ladder of levels and says what its files are (`levels.manifest`).
 MANIFEST = "levels.json"
 

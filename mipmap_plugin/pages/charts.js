@@ -6,6 +6,9 @@ const WIDTH = Math.max(280, Math.min(580, document.documentElement.clientWidth -
 const HEIGHT = 300, MARGIN = { left: 46, right: 14, top: 16, bottom: 42 };
 const LETTER = 6.7; // px, of a name beside a point
 
+// Of the seconds of a run, those that are spent with its steps or after them; all others are spent before the first.
+const WITH_STEPS = ["optimization", "pseudo truth", "validation", "total"];
+
 /** Round numbers that divide a range into about `count` parts. */
 function ticksOf(low, high, count = 5) {
   const rough = (high - low || 1) / count, power = 10 ** Math.floor(Math.log10(rough));
@@ -73,8 +76,8 @@ function curveChart(report) {
   });
   const readout = make("p", { class: "readout", "aria-live": "polite" }, "Point at a mark, or tap it, to read it.");
   const start = curve[0];
-  const before = ["compilation", "motion", "blend weights", "merging", "thinning", "closed form", "upsampling"].filter((phase) => report.seconds[phase] >= 0.005)
-    .map((phase) => `${phase} ${report.seconds[phase].toFixed(2)} s`).join(", ");
+  const before = Object.entries(report.seconds).filter(([phase, seconds]) => !WITH_STEPS.includes(phase) && seconds >= 0.005)
+    .map(([phase, seconds]) => `${phase} ${seconds.toFixed(2)} s`).join(", ");
   const made = Object.keys(report.validation).find((name) => name.startsWith("the start, "));
   svg.prepend(draw("rect", { class: "before-steps", x: place.x(0), y: MARGIN.top, width: place.x(start.seconds) - place.x(0), height: HEIGHT - MARGIN.top - MARGIN.bottom }));
   if (base) {

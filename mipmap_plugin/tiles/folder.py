@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mipmap_plugin.formats.atomic import named
+from mipmap_plugin.models.places import TILES
 
 # What all jobs need of the scene; the base's splats; what the start is called, and its PSNR.
 CUT, BASE, START = "cut.pt", "base.splats", "start.pt"
@@ -13,7 +14,7 @@ CUT, BASE, START = "cut.pt", "base.splats", "start.pt"
 def work_folder(target: Path) -> Path:
     """Where the parts of a scene lie until it is whole, beside its file."""
     target = named(target)
-    return target.with_name(target.name + ".tiles")
+    return target.with_name(target.name + TILES)
 
 
 def truth_file(folder: Path, part: int) -> Path:

@@ -51,20 +51,21 @@ def draw_halos(scene: TiledScene, part: int, sweep: Sweep) -> None:
 
 def _halos(scene: TiledScene, view: Camera, layers: list[Album]) -> Iterator[tuple[int, Tensor, Box]]:
     """Tiles with their halos in a view, [h, w, 5] in 8 bits: the transmittance of what is in front, what is seen of what is behind,
-    and the fraction of the pixel's blend weights that the tile has."""
+    and the fraction of the pixel's blend weights that the tile has. Layers are read twice, so that memory does not hold those of all tiles at once.
+    """
     size = view.zoomed(scene.scale).size
     seen = [number for number in front_to_back(scene.tree, view.center.tolist()) if view.name in layers[number]]
     boxes = {number: layers[number].box(view.name) or (0, 0, size[1], size[0]) for number in seen}
-    pictures = {number: layers[number][view.name].float() for number in seen}
     fronts, through = {}, torch.ones(*size, 1)
     for number in seen:
         front = within(through, boxes[number])
         fronts[number] = front.clone()
-        front *= pictures[number][..., 3:]
+        front *= layers[number][view.name][..., 3:]
     all_weights = (1 - through).clamp_min(INVISIBLE)
     behind = torch.tensor(scene.target.background).expand(*size, 3).clone()
     for number in reversed(seen):
-        layer, front, back = Layer(pictures[number][..., :3], pictures[number][..., 3:]), fronts[number], within(behind, boxes[number])
+        picture, front, back = layers[number][view.name].float(), fronts.pop(number), within(behind, boxes[number])
+        layer = Layer(picture[..., :3], picture[..., 3:])
         weights = front * (1 - layer.transmittance)
         halo = torch.cat([front, front * back, weights / within(all_weights, boxes[number])], dim=2)
         back.copy_(layer.over(back))

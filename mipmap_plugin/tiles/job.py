@@ -53,7 +53,7 @@ class TileJob(Job):
 
     def _do(self, scene: TiledScene) -> None:
         if self.work == "truth":
-            return draw_truths(scene, self.number, [scene.at(job.scale, job.config(), work_folder(job.target)) for job in self.others])
+            return draw_truths(scene, self.number, [scene.at(job, work_folder(job.target)) for job in self.others])
         if self.work == "start":
             return StartSearch(scene).run()
         sweep = sweep_of(scene, self.sweep)

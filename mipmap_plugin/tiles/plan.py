@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +14,15 @@ from mipmap_plugin.errors import MipmapPluginError, SettingsError
 from mipmap_plugin.formats.atomic import new_file, refuse_output, refuse_unwritable, sha256, write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.splat_transform import is_written
+from mipmap_plugin.formats.staging import claim as lock
+from mipmap_plugin.formats.staging import missing_folders, release, remove_empty
 from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.models.adapted_scale import refuse_adapted
 from mipmap_plugin.models.outputs import parts_of
+from mipmap_plugin.models.places import PLAN
 from mipmap_plugin.splatting.viewers import viewers_for
 from mipmap_plugin.tiles.folder import BASE, CUT, work_folder
 from mipmap_plugin.tiles.reading import find_splats, make_cut
-
-# What the folder's tiles belong to.
-PLAN = "plan.json"
 
 # Of the folder's files: those of another format are not gone on with.
 FORMAT = 5
@@ -48,6 +48,20 @@ def refuse(job: Job, tiles: int) -> None:
     refuse_output(job.target, job.overwrite, parts_of(base, None))
     copies = 1 if (work_folder(job.target) / CUT).exists() else 2  # one is kept beside the output until all is done
     refuse_unwritable(job.target, copies * base.stat().st_size, what="the tiles take at least")
+
+
+@contextmanager
+def alone(jobs: Sequence[Job]) -> Iterator[None]:
+    """Inside, no other command works on the tiles of these jobs, or deletes them. Raises SettingsError where one does; OSError."""
+    with ExitStack() as held:
+        for folder in dict.fromkeys(work_folder(job.target) for job in jobs):
+            held.callback(remove_empty, missing_folders(folder.parent))
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            place = folder.with_name(f".{folder.name}.lock")
+            if (descriptor := lock(place)) is None:
+                raise SettingsError(f"{folder}: another command is making these tiles; wait until it has ended, or choose another output")
+            held.callback(release, place, descriptor)
+        yield
 
 
 def claim(jobs: Sequence[Job], tiles: int) -> None:

@@ -61,7 +61,7 @@ def make_cut(path: Path, tiles: int, folder: Path) -> None:
     kept = valid.nonzero()[:, 0]
     if len(kept) < tiles:
         raise CheckpointError(f"{checkpoint.path} has {len(kept):,} splats, which cannot be cut into {tiles} tiles; give fewer")
-    cores, tree = cut(splats.places, kept, tiles)
+    cores, tree = cut(splats.places[:, :3], kept, tiles)  # without sizes, which are no places
     if not found.drawn:
         raise CheckpointError(f"{checkpoint.path}: every splat has an opacity below 1/255, so none is drawn; the training or the export failed")
     told = found.doubts(len(rows))

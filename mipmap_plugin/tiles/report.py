@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.adaptation.optimization.amount import fewer_note
+from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.report import Report, filters, simulated, versions
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.models.mip import unread
 from mipmap_plugin.tiles.scene import TiledScene
+from mipmap_plugin.tiles.steering import result
 
 
-def make_report(scene: TiledScene, files: Sequence[Path], seconds: dict[str, float], validation: dict[str, float], returned: str) -> Report:
-    """The report of the whole. `files`: what it is made of; `validation`: dB of each state on views that nothing was adapted to."""
+def make_report(
+    scene: TiledScene,
+    files: Sequence[Path],
+    tiles: Sequence[Mapping[str, Any]],
+    seconds: dict[str, float],
+    validation: dict[str, float],
+    returned: str,
+) -> Report:
+    """The report of the whole. `files`: what it is made of; `tiles`: what there is to say of each in each sweep; `validation`: dB of each state on
+    views that nothing was adapted to."""
     after = sum(read_header(file).vertex.count for file in files)
     model, config = scene.wrapped.model, scene.config
-    large = fewer_note(scene.asked_steps, config)
+    steps = max((tile["step"] for tile in tiles), default=0)
     lost = [f"the extra columns {', '.join(scene.extras)} are dropped, since tiles hold none"] if scene.extras else []
     lost += [sentence for sentence in [unread(scene.viewer, model, files[0])] if sentence]
     for note in lost:
@@ -39,10 +50,20 @@ def make_report(scene: TiledScene, files: Sequence[Path], seconds: dict[str, flo
         gaussians_before=sum(map(len, scene.cores)),
         gaussians_after=after,
         seconds=seconds,
-        ended_by=f"{len(files)} tiles{large and f' of {config.steps} steps{large}'}",
+        ended_by=_ended_by(scene, tiles, f"{len(files)} tiles of {steps} steps"),
         returned=returned,
         validation=validation,
-        curve=[CurvePoint(step=config.steps, seconds=seconds["total"], psnr_db=None, validation_db=psnr, gaussians=after)],
+        curve=[CurvePoint(step=steps, seconds=seconds["total"], psnr_db=None, validation_db=psnr, gaussians=after)],
         versions=versions(),
         notes=[*scene.doubts, *lost],
     )
+
+
+def _ended_by(scene: TiledScene, tiles: Sequence[Mapping[str, Any]], what: str) -> str:
+    """Why the run ended: the whole reached its target, the time of a tile was over, or all steps were taken. `what`: its tiles and steps."""
+    config, budget = scene.config, End.TIME.told(scene.config, 0)
+    if config.target_db is not None and result(scene.folder).psnr >= config.target_db:
+        return f"{End.TARGET.told(config, 0)}, {what}"
+    if any(tile["ended_by"] == budget for tile in tiles):
+        return f"{budget}, {what} at most"
+    return what + fewer_note(scene.asked_steps, config)

@@ -30,7 +30,7 @@ from mipmap_plugin.progress import announced, counted
 from mipmap_plugin.tiles.folder import START, halo_file, layer_file, part_file, run_file, steered_file, truth_file, work_folder
 from mipmap_plugin.tiles.job import TileJob, Work
 from mipmap_plugin.tiles.judge import JOINED, judged
-from mipmap_plugin.tiles.plan import claim, cut_for, refuse
+from mipmap_plugin.tiles.plan import alone, claim, cut_for, refuse
 from mipmap_plugin.tiles.report import make_report
 from mipmap_plugin.tiles.scene import TiledScene, close_opened, opened
 from mipmap_plugin.tiles.steering import Steered, open_state, result, sweep_of
@@ -65,11 +65,16 @@ def adapt_in_tiles(job: Job, tiles: int, engine: Engine = in_this_process, threa
 
 def adapt_all_in_tiles(jobs: Sequence[Job], tiles: int, engine: Engine = in_this_process, threads: int | None = None) -> Iterator[Joined]:
     """`adapt_in_tiles` of one base for several scales or viewers: it is cut once, and each picture of it is drawn once for all that need it."""
+    for job in jobs:
+        refuse(job, tiles)
+    with alone(jobs):
+        yield from _adapt_all(jobs, tiles, engine, threads)
+
+
+def _adapt_all(jobs: Sequence[Job], tiles: int, engine: Engine, threads: int | None) -> Iterator[Joined]:
     began = time.perf_counter()
     if not jobs:
         return
-    for job in jobs:
-        refuse(job, tiles)
     claim(jobs, tiles)
     with announced("cutting"):
         cut_for(jobs, tiles)
@@ -114,7 +119,7 @@ def _adapted_and_saved(scene: TiledScene, stages: _Stages, began: float, threads
     stages.seconds["total"] = time.perf_counter() - began
     with announced(f"writing {stages.job.target.name}"):
         files = _write_parts(scene, returned)
-        report = make_report(scene, files, stages.seconds, validation, returned)
+        report = make_report(scene, files, facts, stages.seconds, validation, returned)
         saved = _save(scene, stages.job, files, Joined(stages.job.target, report, facts))
     close_opened()
     shutil.rmtree(scene.folder)

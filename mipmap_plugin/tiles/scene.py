@@ -27,6 +27,7 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.formats.ply_rows import PlyRows
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.jobs.base import COLORS, Base
+from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.models.exposure import read_exposures
 from mipmap_plugin.models.inria_folder import read_options, trained_scale
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
@@ -133,10 +134,12 @@ class TiledScene:
         """The views of all sweeps, and those of validation."""
         return [*views_of(self.views.adapted, self.config, 0, self.config.steps), *self.views.steering, *self.views.choosing]
 
-    def at(self, scale: float, config: AdaptConfig, folder: Path) -> TiledScene:
-        """The same scene at another scale, for its truths only: its views, and the base that they show. It shares this one's memory."""
+    def at(self, job: Job, folder: Path) -> TiledScene:
+        """The same scene as another job asks for it, for its truths only: its views, and the base that they show. It shares this one's memory."""
         other = copy(self)
-        other.scale, other.config, other.folder = scale, self._affordable(config), folder
+        other.scale, other.viewer, other.folder = job.scale, job.viewer, folder
+        other.target = self.wrapped.effects(viewer=job.viewer)
+        other.config = other._affordable(job.config())
         for name in ("views", "sweeps", "used_views"):
             other.__dict__.pop(name, None)
         return other

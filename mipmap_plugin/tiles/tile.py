@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
@@ -26,6 +27,9 @@ from mipmap_plugin.tiles.sweeps import Sweep
 
 # A tile is not steered by itself (`steering`), and ends with the last sweep, or when its time is over.
 STEERED_AS_A_WHOLE = {"returns": "last", "target_db": None, "patience": None}
+
+# Why a tile takes no further step in a sweep, if it has all of them.
+SWEEP = "the end of the sweep"
 
 
 class Tile:
@@ -49,7 +53,8 @@ class Tile:
         student = self.student
         if not seen:
             self._write(student.parameters(), self.sweep.checks)
-            return {}, facts | {"splats_after": len(student), "ended_by": "no view shows enough of it", "seconds": 0.0}, None
+            facts |= {"step": self.sweep.first, "splats_after": len(student), "ended_by": "no view shows enough of it", "seconds": 0.0}
+            return {}, facts, None
         if not self.scene.target.sh_degree:
             student.parameters()["shN"].requires_grad_(False)
         task, keeper = self._task(), StateKeeper(resume, self._fingerprint())
@@ -63,9 +68,11 @@ class Tile:
             keeper.save_if_due(run)
             return run.step >= self.sweep.end
 
-        ended_by = adapt(run, task, self.config, keeper.save_and_stop, after_step).told(self.config, run.step)
+        end = adapt(run, task, self.config, keeper.save_and_stop, after_step)
+        ended_by = SWEEP if end is End.OBSERVER else end.told(self.config, run.step)
         self._write(run.student.parameters(), [step for step in self.sweep.checks if step > run.step])
-        facts |= {"splats_after": len(run.student.parameters()["means"]), "ended_by": ended_by, "seconds": time.perf_counter() - began}
+        after = len(run.student.parameters()["means"])
+        facts |= {"step": run.step, "splats_after": after, "ended_by": ended_by, "seconds": time.perf_counter() - began}
         return {"optimizer": run.optimizer.state_dict(), "step": run.step, "seconds": run.watch.seconds}, facts, keeper
 
     def _write(self, parameters: dict[str, Any], steps: Any) -> None:

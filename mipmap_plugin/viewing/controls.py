@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -31,6 +32,9 @@ DISTANCE, LENS = "distance", "focal length"
 PIXELS = ("1", "2", "4", "8")
 
 CURVE = "dB of this picture against the supersampled base, over seconds"
+
+# What Markdown and the HTML in it take for marks: viser renders both, scripts too.
+MARK = re.compile(r"([\\`*_\[\]<>&~#|!])")
 
 LEAST_S, USUAL_S, MOST_S = 1.0, 30.0, 3600.0
 
@@ -120,12 +124,17 @@ def _columns(progress: Progress) -> tuple[Any, ...]:
     return tuple(torch.tensor(column, dtype=torch.float64).numpy() for column in (seconds, psnrs, base))
 
 
+def plain(text: str) -> str:
+    """A text as Markdown that shows it as it is, whatever names of files are in it."""
+    return MARK.sub(r"\\\1", text)
+
+
 def figures(picture: Picture) -> str:
     """A picture's figures, in Markdown."""
     splats = [] if picture.splats is None else ["{:,} of {:,} splats".format(*picture.splats)]
     difference = [] if picture.psnr_db is None else [f"{picture.psnr_db:.2f} dB apart"]
     parts = [f"{picture.drawn.width} × {picture.drawn.height} px", f"{1000 * picture.seconds:,.0f} ms", *splats, *difference]
-    return f"**×{picture.zoom:.3g}** · {picture.shown}\n\n{' · '.join(parts)}"
+    return f"**×{picture.zoom:.3g}** · {plain(picture.shown)}\n\n{' · '.join(parts)}"
 
 
 def words(progress: Progress) -> str:
@@ -134,7 +143,7 @@ def words(progress: Progress) -> str:
         return ""
     name = f"×{progress.wish.scale:g} for {progress.wish.viewer or 'renderers that draw as its training did'}"
     if progress.trouble:
-        return f"{name}: {progress.trouble}"
+        return f"{name}: {plain(progress.trouble)}"
     if progress.adapted is not None:
         report = progress.adapted.report
         before, after = report.psnr_before(), report.psnr_after()

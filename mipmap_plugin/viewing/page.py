@@ -18,7 +18,7 @@ from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.errors import MipmapPluginError, SettingsError
 from mipmap_plugin.limits import is_out_of_memory
 from mipmap_plugin.viewing.adapting import Adapter, Live, Wish
-from mipmap_plugin.viewing.controls import AS_TRAINED, DISTANCE, NOWHERE, Controls
+from mipmap_plugin.viewing.controls import AS_TRAINED, DISTANCE, NOWHERE, Controls, plain
 from mipmap_plugin.viewing.pace import STILL_S, Pace
 from mipmap_plugin.viewing.screen import Pose, by_distance, by_lens, pose_of, up_of, zoomed
 from mipmap_plugin.viewing.server import served, without_words
@@ -103,7 +103,7 @@ class Page:
             return work(*of)
         except Exception as error:
             expected = isinstance(error, MipmapPluginError)
-            told = OUT_OF_MEMORY if is_out_of_memory(error) else str(error) if expected else f"{type(error).__name__}: {error}"
+            told = OUT_OF_MEMORY if is_out_of_memory(error) else plain(str(error) if expected else f"{type(error).__name__}: {error}")
             if not expected and told not in (OUT_OF_MEMORY, self._controls.figures.content):
                 traceback.print_exc()
             self._controls.figures.content = told
@@ -256,9 +256,9 @@ class Page:
         try:
             saved = adapted.save(self._settings.output(adapted.report.scale, adapted.report.viewer))
         except MipmapPluginError as error:
-            self._controls.told.content = str(error)
+            self._controls.told.content = plain(str(error))
         else:
-            self._controls.told.content = f"saved: {saved}"
+            self._controls.told.content = plain(f"saved: {saved}")
             self._controls.save.disabled = True
 
 

@@ -268,6 +268,15 @@ def test_the_slider_shows_the_level_of_each_zoom(open_page: Open, ladder: Path) 
     assert page.text_content(".names .right").startswith("level shown")
 
 
+def test_all_that_was_done_before_the_first_step_is_told(open_page: Open, tmp_path: Path) -> None:
+    """A zoom-in for another filter is converted first."""
+    words = ["adapt", tiny.folder(tmp_path / "base"), "--scale", "2", "--viewer", "antialiased", "--steps", "4", "--output", tmp_path / "out.ply"]
+    assert main([str(word) for word in (*words, "--report")]) == 0
+    seconds = json.loads((tmp_path / "out.ply.adaptation.json").read_text())["seconds"]
+    told = open_page(tmp_path / "out.ply.report.html").inner_text("#curve .note")
+    assert f"Shaded, before the first step: conversion {seconds['conversion']:.2f} s, " in told
+
+
 def test_the_curve_has_a_mark_for_every_check_and_the_start(open_page: Open, tmp_path: Path) -> None:
     base = tiny.folder(tmp_path / "base")
     assert main(["adapt", str(base), "--scale", "1/2", "--steps", "20", "--output", str(tmp_path / "a.ply"), "--report"]) == 0

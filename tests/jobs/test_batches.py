@@ -110,6 +110,8 @@ def test_cameras_of_each_scene(run, tmp_path):
         ("a.ply b.ply", "give --scale"),
         ("a.ply b.ply --scale 4 --bytes 2MB", "one checkpoint at a time"),
         ("a.ply b.ply --scale 4 --report", "one checkpoint at a time"),
+        ("a.ply --scale 4 --report --skip-existing", "without --tiles, --jobs, --dask, --shard, --send-files and --skip-existing"),
+        ("a.ply --jobs 2", "several checkpoints, jobs and tiles need a scale"),
         ("a.ply b.ply --scale 4 --steps -1", "setting steps"),
         ("a.ply b.ply --scale 4 --viewer nobody", "nobody"),
         ("a.ply b.ply --scale 4 --backend nobody", "there is no backend 'nobody'"),
@@ -118,6 +120,7 @@ def test_cameras_of_each_scene(run, tmp_path):
         ("a.ply b.ply --scale 4 --jobs 0", "mipmap-plugin: --jobs must be at least 1, got 0\n"),
         ("a.ply b.ply --scale 4 --threads 0", "mipmap-plugin: --threads must be at least 1, got 0\n"),
         ("a.ply b.ply --scale 4 --jobs 2 --dask local:2", "leave one of them out"),
+        ("a.ply --scale 4 --send-files", "--send-files sends them to the workers of --dask"),
         ("x/a.ply y/a.ply --scale 4 --output new", "would both be written to"),
         ("*.spz --scale 4", "no file or folder fits this pattern"),
         ("--list nowhere.txt --scale 4", "nowhere.txt: No such file"),
@@ -173,11 +176,14 @@ def test_files_that_adaptations_leave_are_left_out(tmp_path):
     job = job_of(tmp_path)
     run_job(job)
     (tmp_path / "out.ply.resume").write_bytes(b"")
-    (tmp_path / "ladder").mkdir()
-    (tmp_path / "ladder" / "levels.json").write_text("{}")
+    (tmp_path / "out.ply.report.html").write_text("<!doctype html>")
+    for folder, file in {"ladder": "levels.json", "tiled.tiles": "plan.json"}.items():
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / file).write_text("{}")
     kept, left_out = without_outputs(sorted(tmp_path.iterdir()))
     assert kept == [tmp_path / "base.ply", tmp_path / "cameras.json"]
-    assert {path.name for path in left_out} == {"ladder", "out.ply", "out.ply.adaptation.json", "out.ply.resume"}
+    beside = {f"out.ply.{ending}" for ending in ("adaptation.json", "report.html", "resume")}
+    assert {path.name for path in left_out} == {"ladder", "out.ply", "tiled.tiles"} | beside
 
 
 def test_a_list_of_another_editor_is_read_and_an_empty_one_is_named(tmp_path):

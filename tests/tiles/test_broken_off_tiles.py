@@ -191,3 +191,18 @@ def test_a_disk_that_is_full_before_the_base_is_cut_leaves_no_plan_behind(job, m
     with pytest.raises(OutputError, match="no space left"):
         next(adapt_all_in_tiles([job], 2))
     assert not work_folder(job.target).exists()
+
+
+def test_two_commands_do_not_make_the_same_tiles(job):
+    """The one that ended first would delete the folder of the other."""
+    asked = []
+
+    def engine(jobs):
+        if not asked:
+            asked.append(jobs)
+            with pytest.raises(SettingsError, match=r"out\.ply\.tiles: another command is making these tiles"):
+                adapt_in_tiles(job, 3)
+        yield from in_this_process(jobs)
+
+    assert adapt_in_tiles(job, 3, engine).file.is_file() and asked
+    assert {path.name for path in job.target.parent.iterdir()} == {"scene", "out.ply", "out.ply.adaptation.json"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,9 @@ from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.backends.base import AdamStep
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.tiles.folder import layer_file
+from mipmap_plugin.tiles.halo import _halos
+from mipmap_plugin.tiles.pictures import Album
 from mipmap_plugin.tiles.run import adapt_in_tiles
 from mipmap_plugin.tiles.steering import Steered, open_state
 from mipmap_plugin.tiles.store import Store
@@ -45,6 +49,23 @@ def test_a_core_in_its_halo_looks_as_in_the_whole_scene(halved):
     for own, halo in zip(rows, around, strict=True):
         crop = halo.crop(view)
         assert torch.allclose(halo.render(splats[own], crop), shown_in(halved, splats, view, crop), atol=3e-3)  # layers have 16 bits
+
+
+def test_the_layers_of_a_view_are_not_all_in_memory_at_once(halved):
+    """Of 64 tiles in large views they would take a gigabyte."""
+
+    class Counted(Album):
+        def __getitem__(self, name):
+            picture = super().__getitem__(name).float()
+            living.add(picture)
+            most.append(len(living))
+            return picture
+
+    living, most = weakref.WeakSet(), []
+    sweep = halved.sweeps[0]
+    layers = [Counted([layer_file(halved.folder, number, sweep.halos)]) for number in range(3)]
+    assert len(list(_halos(halved, halved.sweep_views(sweep)[0], layers))) == 3
+    assert max(most) <= 2
 
 
 def test_a_change_of_the_core_shows_as_far_as_the_halo_lets_it_through(halved):

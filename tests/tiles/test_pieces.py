@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import tiny
 import torch
@@ -12,10 +14,14 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.ply_rows import PlyRows, concatenate
+from mipmap_plugin.formats.torch_file import load_torch
+from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.tiles import slabs
 from mipmap_plugin.tiles.cut import cut, front_to_back
+from mipmap_plugin.tiles.folder import CUT
 from mipmap_plugin.tiles.pictures import Album, write_pictures
+from mipmap_plugin.tiles.reading import make_cut
 from mipmap_plugin.tiles.slabs import Painter
 from mipmap_plugin.tiles.splats import Splats
 from mipmap_plugin.tiles.store import Store, write_store
@@ -61,6 +67,15 @@ def test_far_strays_do_not_decide_the_axis():
     means[:5, 0] += 1e4
     (low, high), _ = cut(means, torch.arange(500), 2)
     assert means[low, 1].max() <= means[high, 1].min()
+
+
+def test_sizes_of_splats_do_not_decide_where_a_scene_is_cut(tmp_path):
+    """Its cameras are on one side of each plane, and of no size."""
+    splats = tiny.gaussians(200, spread=0.1)
+    sizes = torch.logspace(-2, 2, 200)[:, None].expand(-1, 3)
+    ply = VanillaModel.from_gaussians(replace(splats, scales=sizes), TrainedScale()).save(tmp_path / "scene.ply", provenance={})
+    make_cut(ply, 8, tmp_path)
+    assert sorted(front_to_back(load_torch(tmp_path / CUT)["tree"], (0.0, 0.0, 0.0))) == list(range(8))
 
 
 @pytest.mark.parametrize("count", [2, 5, 8])

@@ -31,14 +31,14 @@ def test_columns_that_tiles_do_not_hold_are_told_of(job):
     write_ply(file, columns | {"label": columns["x"]}, overwrite=True)
     scene = cut_in_three(job)
     with pytest.warns(UserWarning, match="the extra columns nx, ny, nz, label are dropped, since tiles hold none"):
-        assert make_report(scene, [file], {"total": 1.0}, {}, "the start").notes
+        assert make_report(scene, [file], [], {"total": 1.0}, {}, "the start").notes
 
 
 def test_a_second_set_of_colors_that_is_left_out_is_told_of(job):
     [file] = job.base.checkpoint.rglob("*.ply")
     columns = read_ply(file).columns
     write_ply(file, columns | dict.fromkeys(("red", "green", "blue"), columns["x"]), overwrite=True)
-    [note] = make_report(cut_in_three(job), [file], {"total": 1.0}, {}, "the start").notes
+    [note] = make_report(cut_in_three(job), [file], [], {"total": 1.0}, {}, "the start").notes
     assert note.startswith("its columns red, green and blue are left out")
 
 
@@ -57,7 +57,7 @@ def test_bands_that_the_loader_of_a_viewer_does_not_read_are_told_of(job):
     scene = cut_in_three(job)
     scene.viewer = "spark"
     with pytest.warns(UserWarning, match="SH bands above degree 3 are left out, which loaders of spark do not read right"):
-        assert make_report(scene, [file], {"total": 1.0}, {}, "the start").notes
+        assert make_report(scene, [file], [], {"total": 1.0}, {}, "the start").notes
 
 
 def test_places_that_float32_does_not_hold_are_told_of(job):
@@ -78,7 +78,7 @@ def test_splats_that_are_doubtful_or_left_out_are_told_of(job):
     with pytest.warns(UserWarning, match=r"the opacities look like 0..1"), pytest.warns(UserWarning, match="1 of 160 splats was dropped"):
         scene = cut_in_three(job)
     doubts = [ACTIVATED, "1 of 160 splats was dropped: not finite once activated"]
-    assert make_report(scene, [file], {"total": 1.0}, {}, "the start").notes == doubts
+    assert make_report(scene, [file], [], {"total": 1.0}, {}, "the start").notes == doubts
 
 
 def test_invalid_splats_are_left_out(tmp_path, job):
@@ -170,7 +170,7 @@ def test_jobs_of_several_bases_or_of_one_output_are_refused(job, tmp_path):
     ("words", "reason"),
     [
         ("a.ply b.ply --scale 1/2 --tiles 2", "--tiles cuts one checkpoint"),
-        ("a.ply --scale 1/2 --tiles 2 --report", "without tiles"),
+        ("a.ply --scale 1/2 --tiles 2 --report", "without --tiles"),
         ("a.ply --scale 1/2 --tiles 2 --dask local:2 --send-files", "leave --send-files out"),
     ],
 )

@@ -10,18 +10,24 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import tiny
+import torch
 from cut_scenes import base_pictures
 
+from mipmap_plugin import register_viewer
 from mipmap_plugin.adaptation.optimization import loop
+from mipmap_plugin.camera import viewmat_of
 from mipmap_plugin.cli import main
 from mipmap_plugin.formats.ply import read_header, read_ply
 from mipmap_plugin.jobs.base import Base
+from mipmap_plugin.levels.distance.mixture import together
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.mip import MipModel
 from mipmap_plugin.models.reading import load_vanilla
 from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.splatting.packing import COLOR_LIMITS
+from mipmap_plugin.splatting.viewers import Viewer
 from mipmap_plugin.tiles import plan, run
 from mipmap_plugin.tiles.reading import make_cut
 from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
@@ -53,6 +59,22 @@ def test_a_large_scene_takes_fewer_steps_in_tiles_too(job, monkeypatch):
     report = adapt_in_tiles(replace(job, settings=settings), 2).report
     assert report.settings.steps == report.curve[-1].step == 4
     assert report.ended_by.startswith("2 tiles of 4 steps (of 16, because the scene is large")
+
+
+@pytest.mark.parametrize(
+    ("settings", "ended_by", "step"),
+    [
+        ({}, "2 tiles of 4 steps", 4),
+        ({"target_db": 1.0, "warm_up": 0.5}, "target of 1 dB against the pseudo truth, 2 tiles of 2 steps", 2),
+        ({"time_budget_s": 1e-6}, "time budget of 1e-06 s, 2 tiles of 1 steps at most", 1),
+        ({"steps": 0}, "2 tiles of 0 steps", 0),
+    ],
+)
+def test_the_report_says_why_the_run_ended(job, settings, ended_by, step):
+    joined = adapt_in_tiles(replace(job, settings=job.settings | settings), 2)
+    assert (joined.report.ended_by, joined.report.curve[-1].step) == (ended_by, step)
+    if not settings:
+        assert {tile["ended_by"] for tile in joined.tiles} == {"the end of the sweep"}
 
 
 def test_a_file_for_a_filter_that_the_tag_does_not_tell_whole_is_read_back_with_its_dilation(job):
@@ -121,6 +143,24 @@ def test_scales_of_other_views_draw_their_own(job, monkeypatch):
     sizes = base_pictures(monkeypatch)
     assert all(joined.file.exists() for joined in adapt_all_in_tiles(jobs, 2))
     assert sizes == [(16, 20)] * 5 + [(8, 10)] * 5
+
+
+def test_viewers_of_other_near_planes_draw_their_own_views(job):
+    """Nothing but splats a tenth of a unit away is in the second view, which one viewer draws and the other does not."""
+    register_viewer("close", Viewer("close", "One that draws what is close", "nowhere", "classic", 0.3, near_plane=0.01), replace=True)
+    away = torch.tensor([50.0, 0, 0])
+    near = replace(tiny.gaussians(40, spread=0.005), scales=torch.full((40, 3), 0.002))
+    whole = together([tiny.gaussians(80), replace(near, means=near.means + away)])
+    first, *others = tiny.cameras(3, width=20, height=16)
+    beside = first.looking_from(viewmat_of(torch.eye(3, dtype=torch.float64), away.double() - torch.tensor([0, 0, 0.1])), "near")
+    base = job.target.with_name("near")
+    VanillaModel.from_gaussians(whole, TrainedScale()).save(base, provenance={})
+    write_cameras(base / "cameras.json", [first, beside, *others])
+    job = replace(job, base=Base(base))
+    jobs = [replace(job, viewer=viewer, target=job.target.with_name(f"{viewer}.ply")) for viewer in ("classic", "close")]
+    alone = adapt_in_tiles(replace(jobs[1], target=job.target.with_name("alone.ply")), 2)
+    *_, last = adapt_all_in_tiles(jobs, 2)
+    assert "4 given views" in alone.report.views and last.report.validation == alone.report.validation
 
 
 # The command

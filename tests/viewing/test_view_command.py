@@ -18,6 +18,7 @@ from mipmap_plugin.viewing import server as viewing_server
 from mipmap_plugin.viewing.adapting import Progress
 from mipmap_plugin.viewing.controls import MARKS, STOPS, figures, words
 from mipmap_plugin.viewing.server import NO_VISER, check_address, foreign_page, served
+from mipmap_plugin.viewing.sources import File
 from mipmap_plugin.viewing.stage import Look
 
 # Words
@@ -26,6 +27,14 @@ from mipmap_plugin.viewing.stage import Look
 def test_the_figures_are_told(stage, screen):
     text = figures(stage.draw(Look("base", against="supersampled"), screen))
     assert "64 × 48 px" in text and "of 60 splats" in text and "dB apart" in text and "· base" in text
+
+
+def test_names_are_told_as_they_are(stage, screen, base):
+    """The panel takes Markdown, with HTML and scripts in it."""
+    odd, shown = "<b>a_*b*_&amp;.ply", r"\<b\>a\_\*b\*\_\&amp;.ply"
+    name = stage.add(File(odd, base))
+    assert f"· {shown}\n" in figures(stage.draw(Look(name), screen))
+    assert words(Progress(wish(base), trouble=f"{odd} is gone")) == f"×0.5 for renderers that draw as its training did: {shown} is gone"
 
 
 def test_a_run_is_told_from_its_beginning_to_its_end(base):
