@@ -9,12 +9,22 @@ import torch
 from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS
 from mipmap_plugin.backends import BACKENDS
 from mipmap_plugin.models.families import FAMILIES
+from mipmap_plugin.process.garbage import leave_loaded, uncollected
 from mipmap_plugin.recipes import RECIPES
 from mipmap_plugin.splatting.viewers import VIEWERS
 
 pytest.register_assert_rewrite("anchor_models", "commands_run")  # their checks show what they found, as those of tests do
 
 SHARED = Path(__file__).parents[1].parent / "shared"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Nothing that collecting tests makes is garbage, and looking for some took a quarter of its time."""
+    with uncollected():
+        result = yield
+    leave_loaded()
+    return result
 
 
 @pytest.fixture(scope="session")
