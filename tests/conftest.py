@@ -4,6 +4,7 @@ import signal
 from pathlib import Path
 
 import pytest
+import tiny
 import torch
 
 from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS
@@ -82,3 +83,9 @@ def brief_ladders(monkeypatch):
     monkeypatch.setattr("mipmap_plugin.levels.yardstick.VIEWS", 1)
     monkeypatch.setattr("mipmap_plugin.levels.switching.FIRST_STEP", 2.0)
     monkeypatch.setattr("mipmap_plugin.levels.switching.SECOND_STEP", 2.0)
+
+
+@pytest.fixture
+def model_folder(tmp_path):
+    """A base of which one view is for testing."""
+    return tiny.folder(tmp_path / "base", tiny.cameras(3) + tiny.cameras(1, seed=9, split="test"))
