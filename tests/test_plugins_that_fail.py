@@ -1,4 +1,4 @@
-"""Backends, upsamplers, recipes and viewers that break their contract while they are used: a sentence names them, the base stays as it was, and nothing wrong passes for a result."""
+"""Plug-ins that break their contract: a sentence names them, the base stays as it was, and nothing wrong passes for a result."""
 
 import copy
 import sys
