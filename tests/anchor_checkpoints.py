@@ -117,4 +117,4 @@ def trace(network: nn.Module, state: dict[str, torch.Tensor], example: torch.Ten
     network.load_state_dict(state)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        torch.jit.trace(network.eval(), example).save(str(path))
+        torch.jit.trace(network.eval(), example, check_trace=False).save(str(path))

@@ -4,17 +4,28 @@ import signal
 from pathlib import Path
 
 import pytest
+import tiny
 import torch
 
 from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS
 from mipmap_plugin.backends import BACKENDS
 from mipmap_plugin.models.families import FAMILIES
+from mipmap_plugin.process.garbage import leave_loaded, uncollected
 from mipmap_plugin.recipes import RECIPES
 from mipmap_plugin.splatting.viewers import VIEWERS
 
 pytest.register_assert_rewrite("anchor_models", "commands_run")  # their checks show what they found, as those of tests do
 
 SHARED = Path(__file__).parents[1].parent / "shared"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Nothing that collecting tests makes is garbage, and looking for some took a quarter of its time."""
+    with uncollected():
+        result = yield
+    leave_loaded()
+    return result
 
 
 @pytest.fixture(scope="session")
@@ -72,3 +83,9 @@ def brief_ladders(monkeypatch):
     monkeypatch.setattr("mipmap_plugin.levels.yardstick.VIEWS", 1)
     monkeypatch.setattr("mipmap_plugin.levels.switching.FIRST_STEP", 2.0)
     monkeypatch.setattr("mipmap_plugin.levels.switching.SECOND_STEP", 2.0)
+
+
+@pytest.fixture
+def model_folder(tmp_path):
+    """A base of which one view is for testing."""
+    return tiny.folder(tmp_path / "base", tiny.cameras(3) + tiny.cameras(1, seed=9, split="test"))

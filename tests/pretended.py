@@ -81,7 +81,8 @@ class Device(TorchDispatchMode):
         self.operations += 1
         if func.overloadpacket.__name__ in CPU_ONLY:
             raise RuntimeError(f"{func}: torch has it for processors alone")
-        if there and func not in MOVES | TAKES_INDICES and any(not isinstance(tensor, Pretended) and tensor.dim() for tensor in tensors):
+        mixed = there and any(not isinstance(tensor, Pretended) and tensor.dim() for tensor in tensors)
+        if mixed and func not in MOVES | TAKES_INDICES:  # asked last, for operations take long to be looked up in sets
             raise RuntimeError(f"{func}: tensors on two devices")
         goes_there = isinstance(args[0], Pretended) if func is aten.copy_.default else goes_there
         if self._waits(func, args, there and not goes_there):

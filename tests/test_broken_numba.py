@@ -1,14 +1,20 @@
-"""A numba that is installed but does not load is as none: torch renders, slower, and one sentence says why and what to do."""
+"""A numba that is absent, or installed but does not load: torch renders, slower, and one sentence says why and what to do."""
 
 import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 import tiny
+import torch
+from samples import camera, gaussians
 
-from mipmap_plugin.backends import cpu
+from mipmap_plugin.backends import choose_backend, cpu
+from mipmap_plugin.backends.base import Needs
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import BackendUnavailable
 
 REMEDY = f"numba does not load: ImportError: Numba needs NumPy 2.2 or less; {cpu.REINSTALL}"
 
@@ -47,3 +53,21 @@ def test_torch_takes_its_place(told):
 
 def test_the_backend_that_needs_it_ends_in_a_sentence(told):
     assert told["cpu"] == [2, [f"mipmap-plugin: backend 'cpu' cannot do this, but reference can: {REMEDY}"]]
+
+
+def test_without_numba_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(cpu, "missing", lambda: [cpu.NO_NUMBA])
+    g = gaussians(2, dtype=torch.float32)
+    needs = Needs.of(g, Effects(1), gradients=True)
+    assert cpu.CpuBackend().lacking(needs) == [cpu.NO_NUMBA]
+    with pytest.raises(BackendUnavailable, match=r"pip install 'mipmap-plugin\[cpu\]'"):
+        cpu.CpuBackend().render(g, camera(), Effects(1))
+    with pytest.warns(UserWarning, match="numba, which some .* have no wheels of; .*; the backend reference takes its place, many times slower"):
+        assert choose_backend("auto", needs)[0].name == "reference"
+
+
+@pytest.mark.filterwarnings("error")
+def test_numba_is_not_missed_where_it_would_not_do(monkeypatch):
+    monkeypatch.setattr(cpu, "missing", lambda: [cpu.NO_NUMBA])
+    usual = Needs.of(gaussians(2, dtype=torch.float32), Effects(1), gradients=True)
+    assert choose_backend("auto", usual, replace(usual, screen_filter="surfel"))[0].name == "reference"

@@ -7,7 +7,6 @@ import math
 import os
 import subprocess
 import sys
-import time
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -16,13 +15,10 @@ import torch
 from oracle import brute_force
 from samples import camera, gaussians
 
-from mipmap_plugin.backends import choose_backend
-from mipmap_plugin.backends.base import Needs
-from mipmap_plugin.backends.cpu import NO_NUMBA, CpuBackend
+from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.splatting.viewers import BUILT_IN
@@ -34,14 +30,6 @@ BACKEND = CpuBackend()
 WIDE = camera(150, 40, 90.0, 70.0, cx=61.3, cy=24.9)
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 @pytest.fixture
 def threads_for_any_work(monkeypatch):
     """Use as many threads as torch, even for little work."""
@@ -49,6 +37,9 @@ def threads_for_any_work(monkeypatch):
 
     monkeypatch.setattr(threads, "MIN_WORK", 0)
     monkeypatch.setattr(threads, "LEAST_ROWS", 16)
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
 
 
 def leaf(g: Gaussians) -> Gaussians:
@@ -270,92 +261,6 @@ def test_only_tensors_that_require_gradients_get_them():
 
 
 @needs_numba
-def test_power_of_two_in_lanes():
-    import numpy as np
-
-    from mipmap_plugin.backends.cpu_kernels import kernel
-    from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH
-    from mipmap_plugin.backends.cpu_kernels.memory import load, store
-    from mipmap_plugin.backends.cpu_kernels.powers import exp2
-
-    def powers(exponents, out):
-        for at in range(0, len(exponents), WIDTH):
-            store(out, at, exp2(load(exponents, at)))
-
-    exponents = np.linspace(-100, 20, 1 << 16, dtype=np.float32)
-    out = np.empty_like(exponents)
-    kernel(powers)(exponents, out)
-    assert np.abs(out / np.exp2(exponents.astype(np.float64)) - 1).max() < 2e-7
-
-
-@needs_numba
-@pytest.mark.parametrize("name", ["log2", "tanh"])
-def test_functions_in_lanes_of_float64(name):
-    import numpy as np
-
-    from mipmap_plugin.backends.cpu_kernels import kernel, powers
-    from mipmap_plugin.backends.cpu_kernels.lanes import PART
-    from mipmap_plugin.backends.cpu_kernels.memory import load, store
-
-    function = getattr(powers, name)
-
-    def values(arguments, out):
-        for at in range(0, len(arguments), PART):
-            store(out, at, function(load(arguments, at)))
-
-    arguments = np.exp(np.linspace(-80, 80, 1 << 16))
-    out = np.empty_like(arguments)
-    kernel(values)(arguments, out)
-    tolerance = {"log2": {"atol": 1e-9, "rtol": 0}, "tanh": {"atol": 0, "rtol": 4e-7}}[name]
-    np.testing.assert_allclose(out, getattr(np, name)(arguments), **tolerance)
-
-
-@needs_numba
-def test_little_work_runs_in_one_thread():
-    from mipmap_plugin.backends.cpu_kernels.threads import MIN_WORK, team
-
-    torch.set_num_threads(2)
-    assert (team(MIN_WORK - 1).threads, team(MIN_WORK).threads) == (1, 2)
-
-
-@needs_numba
-def test_a_team_does_all_work_exactly_once():
-    import numpy as np
-
-    from mipmap_plugin.backends.cpu_kernels.threads import Team
-
-    done = np.zeros(1000, np.int64)
-
-    def work(start, stop, first):
-        if start == first:
-            time.sleep(0.05)  # long enough for the other threads to empty this thread's queue
-        done[start:stop] += 1
-
-    for threads in (1, 2, 3):
-        Team(threads).share(work, len(done), 0)
-    assert (done == 3).all()
-
-
-@needs_numba
-def test_chunks_of_several_jobs_shrink_and_few_rows_are_not_cut():
-    from mipmap_plugin.backends.cpu_kernels.threads import LEAST_ROWS, Team
-
-    lengths = [stop - start for _, start, stop in Team(2)._ranges(0, [640, 640], least=1)]
-    assert lengths == [320, 160, 80, 40, 40]
-    calls = []
-    Team(2).share(lambda start, stop: calls.append((start, stop)), 2 * LEAST_ROWS, of_rows=True)
-    assert sorted(calls) == [(0, LEAST_ROWS), (LEAST_ROWS, 2 * LEAST_ROWS)]
-
-
-@needs_numba
-def test_a_few_rows_more_are_no_chunk_of_their_own():
-    from mipmap_plugin.backends.cpu_kernels.threads import Team
-
-    assert list(Team(2)._ranges(1, [8300], least=4096)) == [(0, 4150, 8300)]
-    assert [stop - start for _, start, stop in Team(1)._ranges(0, [8300], least=4096)] == [4150, 4150]
-
-
-@needs_numba
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
 def test_a_forked_process_draws_with_threads_of_its_own(threads_for_any_work):
     torch.set_num_threads(2)
@@ -368,25 +273,6 @@ def test_a_forked_process_draws_with_threads_of_its_own(threads_for_any_work):
 
 
 @needs_numba
-@pytest.mark.parametrize("length", [0, 1, 20, 3000])
-def test_depths_sort_as_floats_with_ties_in_order(length):
-    import numpy as np
-
-    from mipmap_plugin.backends.cpu_kernels.records import Lists
-    from mipmap_plugin.backends.cpu_kernels.sorting import SLOT_BITS, sort
-
-    rng = np.random.default_rng(length)
-    depths = rng.choice(np.float32([0.25, 1e-30, 3.0, 3.0000002, 1e30]), length)
-    splats = rng.permutation(length).astype(np.int32)
-    entries = depths.view(np.int32).astype(np.int64) << SLOT_BITS | np.arange(length)
-    members = np.empty_like(splats)
-    unused = np.empty(0, np.int64)
-    sort(0, 1, Lists(np.array([0, length]), members, entries, unused, unused, splats))
-    order = np.argsort(depths, kind="stable")
-    assert np.array_equal(entries, order) and np.array_equal(members, splats[order])
-
-
-@needs_numba
 def test_torch_still_works_after_its_idle_threads_were_dismissed(threads_for_any_work):
     torch.set_num_threads(2)
     values = torch.rand(100_000)
@@ -394,21 +280,3 @@ def test_torch_still_works_after_its_idle_threads_were_dismissed(threads_for_any
     for _ in range(3):
         BACKEND.render(gaussians(20, dtype=torch.float32), camera(), Effects(1))
         assert torch.equal(values.exp().sum(), expected)
-
-
-def test_without_numba_the_error_says_what_to_install(monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.backends.cpu.missing", lambda: [NO_NUMBA])
-    g = gaussians(2, dtype=torch.float32)
-    needs = Needs.of(g, Effects(1), gradients=True)
-    assert BACKEND.lacking(needs) == [NO_NUMBA]
-    with pytest.raises(BackendUnavailable, match=r"pip install 'mipmap-plugin\[cpu\]'"):
-        BACKEND.render(g, camera(), Effects(1))
-    with pytest.warns(UserWarning, match="numba, which some .* have no wheels of; .*; the backend reference takes its place, many times slower"):
-        assert choose_backend("auto", needs)[0].name == "reference"
-
-
-@pytest.mark.filterwarnings("error")
-def test_numba_is_not_missed_where_it_would_not_do(monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.backends.cpu.missing", lambda: [NO_NUMBA])
-    usual = Needs.of(gaussians(2, dtype=torch.float32), Effects(1), gradients=True)
-    assert choose_backend("auto", usual, replace(usual, screen_filter="surfel"))[0].name == "reference"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import platform
 import subprocess
 import sys
@@ -71,6 +72,8 @@ def test_freed_memory_is_given_back_when_asked():
     assert int(subprocess.run([sys.executable, "-c", RETURNED], capture_output=True, check=True).stdout) > 80
 
 
-def test_without_glibc_nothing_is_given_back(monkeypatch):
+def test_without_glibc_nothing_is_asked_of_the_c_library(monkeypatch):
     monkeypatch.setattr(platform, "libc_ver", lambda: ("", ""))
+    monkeypatch.setattr(ctypes, "CDLL", None)
     return_freed_memory()
+    assert not keep_freed_memory()

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from exchange_files import sentence
 from gltf_files import EXTENSION
 
 from mipmap_plugin.cli import main
-from mipmap_plugin.errors import CheckpointError, OutputError, OutputExists, SettingsError
+from mipmap_plugin.errors import OutputError, OutputExists, SettingsError
 from mipmap_plugin.formats import glb
 from mipmap_plugin.formats.gltf import read_gltf
 from mipmap_plugin.formats.readers import refuse_unread
@@ -44,12 +45,6 @@ def assert_moved(read, splats, turn, size=1.0, shift=(0.0, 0.0, 0.0)):
     torch.testing.assert_close(covariances(read), size**2 * turn @ covariances(splats) @ turn.T, atol=1e-6, rtol=1e-4)
     torch.testing.assert_close(read.opacities, splats.opacities, atol=1e-5, rtol=1e-5)
     torch.testing.assert_close(towards(read, directions @ turn.T), towards(splats, directions), atol=1e-4, rtol=1e-4)
-
-
-def sentence(path):
-    with pytest.raises(CheckpointError) as caught:
-        load_model(path)
-    return str(caught.value)
 
 
 def changed(made, *path, to):

@@ -61,7 +61,7 @@ def done(works, seconds=120.0, until=WHOLE):
 
 @pytest.fixture
 def forked(monkeypatch):
-    """Processes that import nothing anew, for pieces that compute nothing."""
+    """Processes that import nothing anew."""
     if "fork" not in multiprocessing.get_all_start_methods():
         pytest.skip("needs fork")
     monkeypatch.setattr("gpu_work.get_context", lambda _: multiprocessing.get_context("fork"))
@@ -111,6 +111,7 @@ def request(data, seconds=300.0, parts=tuple(gpu.UNTIL)):
     return gpu.Request(["cpu"], [(300, 64, 48)], ["classic"], data, 1, 2, began + seconds, "cpu", parts, began)
 
 
+@pytest.mark.usefixtures("forked")
 def test_the_whole_flow_fills_every_part_and_goes_on_with_what_was_missing(data, tmp_path, monkeypatch):
     monkeypatch.setattr(gpu, "FIRST", ((300, 64, 48),))
     monkeypatch.setattr(gpu_views, "WIDTHS", (32,))

@@ -1,8 +1,7 @@
-"""What viewers of levels read: distances of PlayCanvas's rule, geometric errors of 3D Tiles, and files through splat-transform."""
+"""What viewers of levels read: streamed SOG and 3D Tiles, with files through splat-transform."""
 
 import gzip
 import json
-import math
 import struct
 import sys
 from contextlib import contextmanager
@@ -11,16 +10,17 @@ from dataclasses import replace
 import pytest
 import tiny
 import torch
+from two_levels import CHUNKS, LADDER
 
 from mipmap_plugin import cli
 from mipmap_plugin.commands.ladders import _below
 from mipmap_plugin.errors import OutputError, OutputExists, SettingsError
 from mipmap_plugin.formats.atomic import write_json
-from mipmap_plugin.formats.streamed_sog import Chunk, read_chunks
+from mipmap_plugin.formats.streamed_sog import read_chunks
 from mipmap_plugin.levels.exported import readable
 from mipmap_plugin.levels.manifest import MANIFEST
-from mipmap_plugin.levels.streamed import EXTENT, distances, nearer, progression, viewer_settings, write_streamed
-from mipmap_plugin.levels.tiles import SCREEN_ERROR, bounding_box, errors, tileset, write_tile, write_tiles
+from mipmap_plugin.levels.streamed import EXTENT, distances, viewer_settings, write_streamed
+from mipmap_plugin.levels.tiles import bounding_box, tileset, write_tile, write_tiles
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.vanilla import VanillaModel
 
@@ -48,14 +48,6 @@ pathlib.Path(target).write_text(json.dumps({{"asked": words, "lodLevels": 3, "tr
 
 # What it lists; the first is a processor.
 CARDS = "[0] llvmpipe (LLVM 15.0.6, 256 bits)\n[1] NVIDIA GeForce RTX 3090"
-
-CHUNKS = [Chunk((0, 0, 0), (2, 1, 1), (30, 0, 1)), Chunk((2, 0, 0), (4, 1, 1), (10, 0, 1))]
-
-LADDER = {
-    "base_pixel": 0.01,
-    "levels": [{"file": f"level_{number}.ply", "scale": 0.5**number, "splats": 60} for number in range(3)],
-    "switches": [{"zoom": 0.7}, {"zoom": 0.35}],
-}
 
 
 @pytest.fixture
@@ -89,53 +81,6 @@ def made_of_two_levels(folder, *options):
     return [*words, "--by", "zoom", "--views", "given", *options]
 
 
-def test_a_switch_lies_at_the_distance_where_a_base_pixel_has_its_zoom():
-    """A canvas of 1000 px and a field of view of 45 degrees: at that distance a length of one base pixel covers 0.7 px."""
-    focal = 500 / math.tan(math.radians(22.5))
-    near, far = distances(LADDER, 1000)
-    assert focal / near * 0.01 == pytest.approx(0.7) and focal / far * 0.01 == pytest.approx(0.35)
-
-
-def test_distances_become_a_geometric_progression():
-    assert progression([5, 15, 45], 9.0) == pytest.approx((5, 3))
-    assert progression([5], 2.0) == pytest.approx((5, 2))
-    base, multiplier = progression([1, 2, 5], 9.0)
-    assert multiplier == pytest.approx(5**0.5) and base * multiplier == pytest.approx(10 ** (1 / 3))
-
-
-def test_distances_too_close_for_playcanvas_are_spread_around_their_middle():
-    assert progression([5, 5.1], 9.0) == pytest.approx((math.sqrt(5 * 5.1 / 1.2), 1.2))
-    assert progression([0.01], 2.0) == pytest.approx((0.1, 2))
-
-
-def test_chunks_are_taken_to_be_closer_than_their_splats():
-    """By half of the sum of half extents; of a box larger than most, three quarters of what it has more are left out."""
-    assert nearer(CHUNKS) == pytest.approx((1 + 0.5 + 0.5) / 2)
-    large = Chunk((0, 0, 0), (9, 9, 9), (20, 0, 0))
-    assert nearer([*CHUNKS, large]) == pytest.approx((40 * 1 + 20 * (1 + 3.5 / 4 + 2 * (0.5 + 4 / 4)) / 2) / 60)
-
-
-def test_a_page_is_told_to_keep_the_distances():
-    settings, wanted = viewer_settings(LADDER, CHUNKS, 1000), distances(LADDER, 1000)
-    assert settings["lodBaseDistance"] == pytest.approx(wanted[0] - 1) and settings["zooms"] == pytest.approx([0.7, 0.35])
-    assert settings["lodMultiplier"] == pytest.approx((wanted[1] - 1) / (wanted[0] - 1))
-    assert settings["splatBudgetMode"] == "limit" and settings["splatBudget"] == 1_000_000
-    assert settings["lodUpdateDistance"] < 0.05 * settings["lodBaseDistance"]
-
-
-def test_levels_by_distance_are_shown_at_the_distances_that_they_were_made_for():
-    made = LADDER | {"by": "distance", "lodBaseDistance": 3.0, "lodMultiplier": 1.7, "canvas": 500, "chunk_extent": 4}
-    settings = viewer_settings(made, CHUNKS, 1000)
-    assert (settings["lodBaseDistance"], settings["lodMultiplier"]) == (6.0, 1.7)
-
-
-def test_what_playcanvas_takes_for_levels_by_distance_of_a_scene_in_small_units_is_what_is_written():
-    made = LADDER | {"by": "distance", "lodBaseDistance": 0.05, "lodMultiplier": 1.19, "canvas": 1000}
-    settings = viewer_settings(made | {"base_pixel": 0.01 * 0.05 / distances(LADDER, 1000)[0]}, CHUNKS, 1000)
-    assert (settings["lodBaseDistance"], settings["lodMultiplier"]) == (0.1, 1.2)
-    assert settings["zooms"][0] < 0.7  # and not where they were made for
-
-
 def test_of_a_scene_too_small_for_playcanvas_the_command_says_so(ladder, tool):
     write_json(ladder / MANIFEST, LADDER | {"base_pixel": 1e-5}, overwrite=True)
     with pytest.warns(UserWarning, match="no level nearer than 0.1 units, and level 0 should end at 0.017: .* enlarge the scene"):
@@ -153,34 +98,6 @@ def test_a_ladder_of_one_level_is_not_streamed(ladder, tool):
     write_json(ladder / MANIFEST, LADDER | {"switches": []}, overwrite=True)
     with pytest.raises(SettingsError, match="a single level"):
         write_streamed(ladder)
-
-
-def test_a_tile_is_replaced_at_its_switch():
-    """Seen at the zoom 0.7, a base pixel of 0.01 units has 0.7 px, so that the error of the tile that is replaced there has 16."""
-    assert errors(LADDER)[0] == 0
-    assert [error / 0.01 * zoom for error, zoom in zip(errors(LADDER)[1:], (0.7, 0.35), strict=True)] == pytest.approx([SCREEN_ERROR] * 2)
-
-
-def test_tiles_go_from_the_coarsest_to_the_finest():
-    made = tileset(LADDER, [0.0] * 12)
-    tile, uris = made["root"], []
-    while True:
-        uris.append(tile["content"]["uri"])
-        assert tile["refine"] == "REPLACE" and len(tile["boundingVolume"]["box"]) == 12
-        if "children" not in tile:
-            break
-        assert tile["children"][0]["geometricError"] < tile["geometricError"] < made["geometricError"]
-        tile = tile["children"][0]
-    assert uris == ["level_2.glb", "level_1.glb", "level_0.glb"] and made["asset"]["version"] == "1.1"
-
-
-def test_the_box_holds_every_splat():
-    """In the axes of a tile, where (x, y, z) of a PLY lies at (-x, -z, -y)."""
-    box, splats = bounding_box([tiny.model()]), tiny.gaussians()
-    for axis, of_ply in enumerate((0, 2, 1)):
-        center, half = box[axis], box[3 + 4 * axis]
-        assert float(-splats.means[:, of_ply].max()) > center - half and float(-splats.means[:, of_ply].min()) < center + half
-    assert sum(box[3:]) == pytest.approx(box[3] + box[7] + box[11])
 
 
 def test_the_box_of_a_tile_holds_the_large_splats_of_coarser_levels_too(ladder, tool):

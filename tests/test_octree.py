@@ -7,7 +7,7 @@ import ply_files
 import pytest
 import torch
 from anchor_checkpoints import STANDARD, VOXEL, Layout
-from anchor_models import VIEWS, agrees, gain, is_same, refused, state_of
+from anchor_models import VIEWS, agrees, gain, is_same, load, refused, state_of
 
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.ply import read_ply
@@ -25,11 +25,6 @@ LAYOUTS = {
     "progressive, bank": Layout("octree", bank=True, to_level="progressive"),
     "everything": Layout("octree", distance=("color_mlp",), level=True, bank=True, appearance=(4, 2), united=True, to_level="progressive"),
 }
-
-
-def load(tmp_path, layout, **options):
-    checkpoints.write(tmp_path / "model", layout, **options)
-    return load_model(tmp_path / "model")
 
 
 @pytest.mark.parametrize("name", LAYOUTS)

@@ -1,7 +1,5 @@
-"""What tests of commands share: brief options, what a refusal looks like, and the record of a page."""
+"""What tests of commands share: brief options, and what a refusal looks like."""
 
-import json
-import re
 
 QUICK = ["--views", "given", "--steps", "2"]
 NO_STEP = ["--steps", "0"]
@@ -14,8 +12,3 @@ def refused(answer, *words):
     assert err.startswith("mipmap-plugin: ") and err.count("\n") == 1
     assert all(word in err for word in words), err
     return err
-
-
-def record_of(page):
-    """The JSON within a page."""
-    return json.loads(re.search(r'<script type="application/json" id="record">(.*?)</script>', page.read_text(), re.DOTALL)[1])

@@ -1,7 +1,6 @@
-"""The command line, called in a folder of its own, and a checkpoint for it."""
+"""The command line, called in a folder of its own."""
 
 import pytest
-import tiny
 
 from mipmap_plugin.cli import main
 
@@ -21,8 +20,3 @@ def run(capsys, tmp_path_factory, monkeypatch):
         return code, said.out, said.err
 
     return call
-
-
-@pytest.fixture
-def model_folder(tmp_path):
-    return tiny.folder(tmp_path / "base", tiny.cameras(3) + tiny.cameras(1, seed=9, split="test"))

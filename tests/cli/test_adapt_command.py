@@ -10,7 +10,8 @@ from pathlib import Path
 import pressing
 import pytest
 import tiny
-from commands_run import NO_STEP, QUICK, record_of, refused
+from commands_run import NO_STEP, QUICK, refused
+from pages_read import record_of
 
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import provenance_of

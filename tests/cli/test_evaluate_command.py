@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import pytest
 import tiny
-from commands_run import record_of, refused
+from commands_run import refused
+from pages_read import record_of
 
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.commands.adapt import adapt

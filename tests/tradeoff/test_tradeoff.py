@@ -3,7 +3,6 @@
 import csv
 import json
 import re
-import sys
 import time
 from dataclasses import replace
 
@@ -11,7 +10,6 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin import cli
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.evaluation.measure import baselines
@@ -22,7 +20,6 @@ from mipmap_plugin.evaluation.tradeoff.measuring import OBSERVED_STEPS, RENDERER
 from mipmap_plugin.evaluation.tradeoff.points import Plan
 from mipmap_plugin.evaluation.tradeoff.run import run
 from mipmap_plugin.evaluation.tradeoff.truth import base_itself, photographs
-from mipmap_plugin.limits import MAX_SEED
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.screen_filters import SCREEN_FILTERS
 from mipmap_plugin.wrap import Interrupted, wrap_model
@@ -284,48 +281,6 @@ def test_a_picture_is_drawn(tmp_path):
     run(wrapped(), None, [1 / 4], replace(PLAN, repeats=1), 1, Folder(tmp_path, picture=True, overwrite=False))
     assert (tmp_path / "tradeoff.png").read_bytes().startswith(b"\x89PNG")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["tradeoff.csv", "tradeoff.json", "tradeoff.png"]
-
-
-# The command
-
-
-def command(tmp_path, *more):
-    """The exit code of a small comparison; what `more` has takes the place of its own."""
-    folder, own = tmp_path / "base", {"--steps": "2", "--views": "1", "--repeats": "1"}
-    if not folder.exists():
-        tiny.folder(folder, tiny.cameras(3))
-    some = ["--recipe", "default", "--supersampling", "2", "--no-renderers"]
-    some += [word for option in own.items() if option[0] not in more for word in option]
-    return cli.main(["tradeoff", str(folder), "--scale", "1/4", "--output", str(tmp_path / "new"), "--no-picture", *some, *more])
-
-
-def test_the_command_prints_a_table_and_refuses_to_replace_it(tmp_path, capsys):
-    assert command(tmp_path) == 0
-    out = capsys.readouterr().out
-    assert "x0.25, dB against the base supersampled 4 x 4 (no photographs)" in out and "| base  " in out
-    assert command(tmp_path) == 2
-    assert "exists already" in capsys.readouterr().err
-    assert command(tmp_path, "--overwrite", "--json") == 0
-    assert json.loads(capsys.readouterr().out)["complete"]
-
-
-@pytest.mark.parametrize(
-    ("wrong", "reason"),
-    [
-        (["--views", "0"], "views: at least 1"), (["--steps", "-1"], "setting steps"), (["--seed", "-1"], "setting seed"),
-        (["--seed", str(MAX_SEED), "--repeats", "2"], "setting seed"),
-    ],
-)  # fmt: skip
-def test_wrong_options_are_refused_before_anything_is_measured(tmp_path, capsys, monkeypatch, wrong, reason):
-    monkeypatch.setattr(measuring, "_measured", lambda *_: pytest.fail("it is refused before anything is measured"))
-    assert command(tmp_path, *wrong) == 2 and reason in capsys.readouterr().err
-
-
-def test_pictures_without_matplotlib_are_refused_before_anything_is_measured(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    assert command(tmp_path, "--picture") == 2
-    assert "pip install 'mipmap-plugin[plot]'" in capsys.readouterr().err
-    assert not (tmp_path / "new").exists()
 
 
 def test_an_existing_result_is_refused_by_the_library_too(tmp_path):

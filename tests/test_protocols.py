@@ -1,0 +1,150 @@
+"""Metrics, and the protocols by which photographs become truths: as published, or refused in a sentence."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from PIL import Image
+
+from mipmap_plugin.adaptation.target.photographs import at_density_of
+from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.evaluation import protocols
+from mipmap_plugin.evaluation.evaluate import Evaluator
+from mipmap_plugin.evaluation.metrics import SAME_DB, psnr, ssim
+from mipmap_plugin.evaluation.protocols import PROTOCOLS
+from mipmap_plugin.formats.images import write_image
+from mipmap_plugin.scenes import Scene
+
+pytestmark = pytest.mark.usefixtures("few_views")
+
+
+def noise(*shape, seed=0):
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def test_psnr_is_the_mean_square_in_decibel_after_clamping():
+    image, truth = noise(8, 9, 3), noise(8, 9, 3, seed=1)
+    expected = -10 * math.log10(float((image - truth).double().square().mean()))
+    assert psnr(image, truth) == pytest.approx(expected, abs=1e-5)
+    assert psnr(truth + 5, truth) == pytest.approx(psnr(torch.ones(8, 9, 3), truth))
+
+
+def gaussian_window_ssim(image, truth):
+    """Wang et al. 2004 by hand: an 11 x 11 Gaussian window of sigma 1.5 around each pixel, with black around the image, as in the papers' code."""
+    offsets = torch.arange(11, dtype=torch.float64) - 5
+    line = (-(offsets**2) / (2 * 1.5**2)).exp()
+    window = (line[:, None] * line / line.sum() ** 2)[None, None]
+    blur = lambda planes: torch.nn.functional.conv2d(planes, window, padding=5)  # noqa: E731
+    x, y = (each.double().movedim(-1, 0)[:, None] for each in (image, truth))
+    mx, my = blur(x), blur(y)
+    vx, vy, vxy = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
+    c1, c2 = 0.01**2, 0.03**2
+    return float(((2 * mx * my + c1) * (2 * vxy + c2) / ((mx**2 + my**2 + c1) * (vx + vy + c2))).mean())
+
+
+def test_ssim_has_the_literatures_window():
+    image = noise(20, 24, 3)
+    truth = (image + 0.2 * noise(20, 24, 3, seed=1)).clamp(0, 1)
+    assert ssim(image, truth) == pytest.approx(gaussian_window_ssim(image, truth), abs=1e-6)
+    assert ssim(image, image) == pytest.approx(1.0)
+
+
+def test_ssim_is_not_known_for_an_image_smaller_than_its_window():
+    assert ssim(noise(10, 30, 3), noise(10, 30, 3)) is None
+    assert ssim(noise(11, 11, 3), noise(11, 11, 3)) == pytest.approx(1.0)
+
+
+def test_p1_truncates_the_mean_of_blocks():
+    photograph = noise(24, 32, 3)
+    view = protocols.TestView(tiny.cameras(1)[0], photograph, Path("photograph.png"))
+    means = photograph.view(6, 4, 8, 4, 3).mean(dim=(1, 3)) * 255
+    torch.testing.assert_close(view.truth(1 / 4, PROTOCOLS["P1"]) * 255, means.floor(), atol=1e-3, rtol=0)
+
+
+def test_p1_averages_colors_and_alpha_by_themselves_and_composites_afterwards(tmp_path):
+    """A red pixel, a transparent one that is stored blue, and two of half alpha; by hand, with both truncations.
+
+    Means: red 255 / 4 = 63.75 and blue 255 / 4, each 63; alpha (255 + 2 * 128) / 4 = 127.75, so 127, or 0.498. On white
+    63 * 0.498 + 255 * 0.502 = 159.37 and 128. Composited first it would be (255 + 255 + 2 * 127) / 4 = 191 and 127.
+    """
+    block = np.array([[[255, 0, 0, 255], [0, 0, 255, 0]], [[0, 0, 0, 128], [0, 0, 0, 128]]], np.uint8)
+    Image.fromarray(np.tile(block, (24, 32, 1))).save(tmp_path / "photograph.png")
+    cameras = [replace(camera, split="test") for camera in tiny.cameras(1)]
+    [view] = protocols.test_views(Scene(tuple(cameras), {cameras[0]: tmp_path / "photograph.png"}, tmp_path), tiny.cameras(1), (1.0, 1.0, 1.0))
+    for scale in (1, 1 / 2, 1 / 4):  # of a photograph of twice the base's size
+        truth = (view.truth(scale, PROTOCOLS["P1"]) * 255).round().byte()
+        assert truth.shape == (24 * scale, 32 * scale, 3) and truth.unique(dim=0).unique(dim=1).tolist() == [[[159, 128, 159]]]
+    opaque = protocols.TestView(view.camera, view.photograph, view.file, view.background, distorted=True, transparent=True)
+    assert torch.equal(opaque.truth(1, PROTOCOLS["P1"]), PROTOCOLS["P1"].shrunk(view.photograph, (24, 32)))
+    assert torch.equal(view.truth(1 / 2, PROTOCOLS["P3"]), PROTOCOLS["P3"].shrunk(view.photograph, (12, 16)))
+
+
+def test_p1_of_a_photograph_without_whole_blocks_says_what_to_do():
+    view = protocols.TestView(tiny.cameras(1)[0], noise(25, 33, 3), Path("photograph.png"))
+    with pytest.raises(SettingsError, match=r"P1 takes means of whole blocks .*33 x 25 px is not a whole multiple of 8 x 6 px; evaluate by P3"):
+        view.truth(1 / 4, PROTOCOLS["P1"])
+
+
+def test_p3_is_pillows_bicubic_on_bytes_and_not_on_floats():
+    stored = (noise(24, 32, 3) > 0.5).byte().mul(255)  # black and white: Pillow clamps between its two passes
+    view = protocols.TestView(tiny.cameras(1)[0], stored / 255, Path("photograph.png"))
+    bytes_of_pillow = np.asarray(Image.fromarray(stored.numpy()).resize((8, 6), Image.Resampling.BICUBIC))
+    truth = (view.truth(1 / 4, PROTOCOLS["P3"]) * 255).round().byte().numpy()
+    on_floats = (resize(stored / 255, (6, 8), "pil-bicubic").clamp(0, 1) * 255).round().byte().numpy()
+    assert (truth == bytes_of_pillow).all() and (truth != on_floats).any()
+
+
+def test_images_are_judged_as_the_8_bit_files_that_they_would_be_saved_as():
+    image = torch.tensor([-0.1, 0.49 / 255, 0.51 / 255, 1.2])
+    assert all(torch.equal(each.as_saved(image), torch.tensor([0, 0, 1 / 255, 1])) for each in PROTOCOLS.values())
+    assert torch.equal(protocols.Protocol("floats", "area", eight_bit=False).as_saved(image), image)
+    views = [protocols.TestView(tiny.cameras(1)[0], torch.full((24, 32, 3), 100 / 255), Path("photograph.png"))]
+    row = Evaluator(views, PROTOCOLS["P3"]).row("gray", 1, lambda camera: torch.full((*camera.size, 3), 100.4 / 255), gaussians=0)
+    assert row.psnr_db == SAME_DB
+
+
+def test_a_truth_finer_than_the_photograph_is_refused():
+    view = protocols.TestView(tiny.cameras(1)[0], noise(24, 32, 3), Path("photograph.png"))
+    with pytest.raises(SettingsError, match="x2 needs 64 x 48 px, but the photographs have only 32 x 24; evaluate a smaller scale"):
+        view.truth(2, PROTOCOLS["P3"])
+
+
+@pytest.mark.parametrize(("size", "divisor"), [((3286, 4946), 8), ((3361, 5187), 2), ((2078, 3118), 4), ((5992, 4004), 8)])
+def test_a_photograph_is_large_enough_for_a_base_whose_size_was_rounded_up(size, divisor):
+    """Captures of mip-NeRF 360, trained at half, a quarter and an eighth of their size, as in the tables of zoom-in."""
+    height, width = size
+    full = Camera(width, height, 4000.0, 4000.0, width / 2, height / 2, torch.eye(4), "view", "test")
+    base = full.resized(round(width / divisor), round(height / divisor))
+    [camera] = at_density_of([full], [base])
+    view = protocols.TestView(camera, torch.zeros(*size, 3), Path("photograph.png"))
+    assert view.truth(divisor, PROTOCOLS["P3"]).shape[:2] == camera.zoomed(divisor).size
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """A COLMAP scene's photographs, and its copies at a half and, but for rounding, a quarter."""
+    for folder, value, size in (("images", 0.2, (97, 130)), ("images_2", 0.4, (49, 65)), ("images_4", 0.6, (24, 33)), ("masks_4", 0.8, (24, 32))):
+        write_image(tmp_path / folder / "left" / "a.png", torch.full((*size, 3), value))
+    return tmp_path
+
+
+@pytest.mark.parametrize(("scale", "value"), [(1, 0.6), (2, 0.4), (4, 0.2)])
+def test_p4_reads_the_copy_that_has_the_size(folders, scale, value):
+    view = protocols.TestView(replace(tiny.cameras(1)[0], width=33), noise(97, 130, 3), folders / "images_2" / "left" / "a.png")
+    truth = view.truth(scale, PROTOCOLS["P4"])
+    assert truth.shape == (24 * scale, 33 * scale, 3)
+    torch.testing.assert_close(truth, torch.full_like(truth, value), atol=1e-3, rtol=0)
+
+
+def test_p4_refuses_a_size_that_no_folder_has(folders, tmp_path):
+    view = protocols.TestView(tiny.cameras(1)[0], noise(97, 130, 3), folders / "images" / "left" / "a.png")
+    with pytest.raises(SettingsError, match=r"P4 needs a\.png at 16 x 12 px .* but there is 130 x 97, 65 x 49, 33 x 24; evaluate a"):
+        view.truth(1 / 2, PROTOCOLS["P4"])
+    with pytest.raises(SettingsError, match="but there is none"):
+        protocols.ready_made(tmp_path / "a.png", (12, 16))
