@@ -68,8 +68,7 @@ def evaluate(
         upsampler: What makes base images larger: a registered name, or the file of a network.
         resize: Filter that makes base images smaller, instead of the recipe's: area aims at P1, pil-bicubic at P3.
         appearance: Appearance of test views, if training views have their own: mean of these, or upstream (of the view with the same number).
-        cameras: Cameras of the base scale, one scene or cameras.json for each checkpoint, if there are none beside it, as of lone files; may be
-            the folder of the images, if it was trained on these at their size.
+        cameras: For each checkpoint that has none: a cameras.json or a scene, such as the images' if it was trained on these at their size.
         output: Also write the rows, and notes on missing ones, as JSON to this file.
         report: Write a page that shows it all: beside `output`, or else NAME.evaluation.html in this folder, numbered if there is one already.
         overwrite: Replace files that exist.
