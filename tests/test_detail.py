@@ -161,6 +161,21 @@ def test_the_report_says_what_was_enlarged(upsampler):
     assert report.seconds["upsampling"] > 0
 
 
+@pytest.mark.parametrize(
+    ("scale", "settings", "reason"),
+    [
+        (2, dict(recipe="instant"), "recipe instant takes no steps"),
+        (2, dict(compare_at="base", steps=2), "compare_at is base"),
+        (1 / 2, dict(steps=2), "x0.5 is no zoom-in"),
+    ],
+)
+def test_a_network_that_is_not_used_is_told(upsampler, scale, settings, reason):
+    upsampler(lambda image, size: pytest.fail("it is not used"))
+    model = wrap_model(tiny.model(), cameras=tiny.cameras(6))
+    with pytest.warns(UserWarning, match=f"the upsampler mine is not used, because {reason}"):
+        model.adapt(scale, upsampler="mine", **settings)
+
+
 def test_no_more_views_are_enlarged_than_the_steps_use(upsampler):
     enlarged = []
     upsampler(lambda image, size: enlarged.append(size) or resize(image, size, "lanczos"))

@@ -184,7 +184,7 @@ def _connected(place: str) -> Iterator[Client]:
             raise SettingsError(f"--dask {place}: after local: goes the number of workers, at least 1; give local:4 for four workers here")
         with _without_interrupts(), dask.config.set(LOCAL):
             cluster = LocalCluster(
-                n_workers=int(place.removeprefix("local:")), threads_per_worker=1, memory_limit=0, dashboard_address=":0", silence_logs=logging.CRITICAL
+                n_workers=int(place[6:]), threads_per_worker=1, memory_limit=0, dashboard_address=":0", silence_logs=logging.CRITICAL
             )
         with cluster, Client(cluster) as client:
             yield client

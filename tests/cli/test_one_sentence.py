@@ -6,7 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import docstring_parser
 import pytest
 import tiny
 from commands_run import NO_STEP, QUICK, refused
@@ -31,8 +30,7 @@ def test_the_version(run):
 @pytest.mark.parametrize("command", COMMANDS.values())
 def test_the_help_of_an_option_is_one_paragraph(command):
     """A second line of a docstring would begin a new line of the help, in the middle of a sentence."""
-    broken = [param.arg_name for param in docstring_parser.parse(command.__doc__).params if "\n" in param.description]
-    assert broken == []
+    assert re.findall(r"^ {12}.*", command.__doc__, re.MULTILINE) == []
 
 
 def malformed(folder: Path) -> dict[str, Path]:

@@ -23,6 +23,7 @@ from mipmap_plugin.adaptation.target.upsamplers import find_upsampler
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.process.clock import now
+from mipmap_plugin.recipes import INTERPOLATIONS
 
 # Iterations of back-projection: the first improves a GAN's image by 1.4 dB (lego at x2), two more by another 0.2.
 ROUNDS = 3
@@ -33,6 +34,14 @@ TRUST = 0.05
 # The contrast term has the confidence to this further power, the lowest at which a network that makes nothing but noise costs nothing: noise has
 # the strongest contrasts of all, and agrees with the base by chance in places.
 CONTRAST_POWER = 3
+
+
+def unused_network(config: AdaptConfig, scale: float) -> str | None:
+    """That a network was given which this adaptation does not use, and why; None if it is used, or if there is none."""
+    if config.upsampler in INTERPOLATIONS or (scale > 1 and config.steps and config.compare_at != "base"):
+        return None
+    taken = f"recipe {config.recipe} takes no steps" if not config.steps else f"compare_at is {config.compare_at}"
+    return f"the upsampler {config.upsampler} is not used, because {taken if scale > 1 else f'x{scale:g} is no zoom-in'}"
 
 
 class DetailLoss:
