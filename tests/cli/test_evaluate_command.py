@@ -25,6 +25,7 @@ def test_evaluate_prints_a_table_and_writes_its_rows(run, model_folder, tmp_path
     code, out, _ = run(*words)
     assert code == 0
     assert "truth: P1" in out and "real dB over 2 views\n" in out and "| x1 " in out and "| x0.25 " in out and "base, resized" in out
+    assert out.endswith(f"\nwritten: {tmp_path / 'rows.json'}\npage: {tmp_path / 'rows.html'}\n")
     assert "instant, 1 of 2 judged views adapted to" in out  # of the folder's cameras, one is judged
     written = json.loads((tmp_path / "rows.json").read_text())
     rows = written["rows"]
