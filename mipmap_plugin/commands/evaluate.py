@@ -156,6 +156,8 @@ class _Results:
 def _perceptual(network: Literal["alex", "vgg", "vgg-01"] | None, weights: Path | None) -> Perceptual | None:
     from mipmap_plugin.evaluation.perceptual import Perceptual
 
+    if weights and not network:
+        raise SettingsError(f"--lpips-weights {weights}: say which LPIPS this is for; add --lpips alex, vgg or vgg-01")
     return Perceptual(network, weights) if network else None
 
 

@@ -171,6 +171,9 @@ def test_evaluate_refuses_what_cannot_be_judged(run, model_folder, tmp_path):
     refused(run("evaluate", tiny.ply(tmp_path / "a.ply"), "--images", scene, "--scale", "1"), "has no cameras, so its base scale is not known")
     refused(run("evaluate", model_folder, "--images", scene, "--scale", "4"), "the photographs have only 32 x 24")
     refused(run("evaluate", model_folder, "--images", tmp_path / "nowhere", "--scale", "1"), "there is no such file or folder")
+    lpips = "evaluate", model_folder, "--images", scene, "--scale", "1", "--lpips-weights", tmp_path
+    refused(run(*lpips), f"--lpips-weights {tmp_path}: say which LPIPS this is for; add --lpips alex, vgg or vgg-01")
+    refused(run(*lpips, "--lpips", "alex"), f"{tmp_path} is a folder; give the file of the weights of alex in it")
 
 
 def test_a_checkpoint_of_which_nothing_is_drawn_is_refused_before_the_work(run, tmp_path):
