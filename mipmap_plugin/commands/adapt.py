@@ -88,8 +88,6 @@ def adapt(
         json: Print the reports as JSON.
     """
     settings, base = without_none(**vars(changes)) | dict(recipe=recipe, seed=seed), Base(Path(), cameras, background, backend, screen_filter, up)
-    if many.send_files and many.dask is None:
-        raise SettingsError("--send-files is for workers of dask; give --dask, or leave it out")
     if many.tiles is not None or many.asked(checkpoints):
         _refuse_for_many(bool(checkpoints or many.list), scale, bytes, report)
         request = Request(_requests(scale, viewer), output, settings | without_none(most_splats=splats), images, overwrite)

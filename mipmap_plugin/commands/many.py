@@ -45,7 +45,7 @@ class Many:
     def asked(self, checkpoints: Sequence[Path]) -> bool:
         """Whether these are jobs, rather than one checkpoint."""
         options = (self.jobs, self.dask, self.shard)
-        return self.is_list(checkpoints) or self.skip_existing or any(each is not None for each in options)
+        return self.is_list(checkpoints) or self.skip_existing or self.send_files or any(each is not None for each in options)
 
     def is_list(self, checkpoints: Sequence[Path]) -> bool:
         """Whether there may be several checkpoints, so that an output is a folder for all."""
@@ -181,6 +181,8 @@ def engine(many: Many, jobs: Sequence[Job], threads: int | None) -> Generator[Ou
     if count < 1 or (threads is not None and threads < 1):
         raise SettingsError(f"--jobs must be at least 1, got {count}" if count < 1 else f"--threads must be at least 1, got {threads}")
     if many.dask is None:
+        if many.send_files:
+            raise SettingsError("--send-files is for workers of dask; give --dask, or leave it out")
         return in_this_process(jobs, threads) if count == 1 else in_workers(jobs, count, threads)
     if many.jobs is not None:
         raise SettingsError("--jobs are processes of this machine, and --dask has workers of its own; leave one of them out")
