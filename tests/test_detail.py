@@ -1,10 +1,14 @@
 """Zoom-in with an upsampler: which part of its image is believed, and that a bad one does no harm."""
 
+import math
+from types import SimpleNamespace
+
 import pytest
 import tiny
 import torch
 from skimage.metrics import structural_similarity
 
+from mipmap_plugin.adaptation.target import detail as detail_module
 from mipmap_plugin.adaptation.target.detail import CONTRAST_POWER, DetailLoss
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.structure import similarity
@@ -113,9 +117,24 @@ def test_each_view_is_enlarged_once_and_beforehand(upsampler):
     given = []
     upsampler(lambda image, size: given.append(size) or resize(image, size, "pil-bicubic"))
     part, views = detail(picture(24, 32)), tiny.cameras(3)
-    part.prepare(views)
+    assert part.prepare(views, math.inf) == views
     part(views[0], torch.zeros(*SIZE, 3))
     assert given == [SIZE] * 3
+
+
+def test_as_many_views_are_enlarged_as_there_is_time_for(upsampler, monkeypatch):
+    clock = SimpleNamespace(time=0.0)
+
+    def slow(image, size):
+        clock.time += 5.0
+        return resize(image, size, "pil-bicubic")
+
+    upsampler(slow)
+    monkeypatch.setattr(detail_module, "now", lambda device: clock.time)
+    views = tiny.cameras(8)
+    for seconds, count in [(0.1, 1), (14.0, 2), (15.0, 3), (math.inf, 8)]:
+        enlarged = detail(picture(24, 32)).prepare(views, seconds)
+        assert len(enlarged) == count and enlarged == [view for view in views if view in enlarged]
 
 
 # In an adaptation
@@ -135,11 +154,47 @@ def test_a_network_takes_part_by_default_and_a_kernel_does_not():
 
 def test_the_report_says_what_was_enlarged(upsampler):
     upsampler(lambda image, size: resize(image, size, "lanczos"))
-    report = adapted("mine", steps=2, upsampled_views=4).report
+    report = adapted("mine", steps=4, upsampled_views=4).report
     assert report.views == "the 6 train views, 4 of them upsampled"
     assert "and mine fused with it" in report.filters
     assert any("mine adds detail that the base's image does not have" in str(effect) for effect in report.effects)
     assert report.seconds["upsampling"] > 0
+
+
+@pytest.mark.parametrize(
+    ("scale", "settings", "reason"),
+    [
+        (2, dict(recipe="instant"), "recipe instant takes no steps"),
+        (2, dict(compare_at="base", steps=2), "compare_at is base"),
+        (1 / 2, dict(steps=2), "x0.5 is no zoom-in"),
+    ],
+)
+def test_a_network_that_is_not_used_is_told(upsampler, scale, settings, reason):
+    upsampler(lambda image, size: pytest.fail("it is not used"))
+    model = wrap_model(tiny.model(), cameras=tiny.cameras(6))
+    with pytest.warns(UserWarning, match=f"the upsampler mine is not used, because {reason}"):
+        model.adapt(scale, upsampler="mine", **settings)
+
+
+def test_no_more_views_are_enlarged_than_the_steps_use(upsampler):
+    enlarged = []
+    upsampler(lambda image, size: enlarged.append(size) or resize(image, size, "lanczos"))
+    assert adapted("mine", steps=3).report.views == "the 6 train views, 3 of them upsampled" and len(enlarged) == 3
+
+
+def test_a_network_leaves_half_of_a_time_budget_to_the_steps(upsampler, monkeypatch):
+    """Views were all upsampled whatever the budget: with a second for each of 38, a budget of 6 s took 38, and had no step."""
+    asked = []
+
+    def prepare(self, views, seconds):
+        asked.append(seconds)
+        return views[:2]
+
+    upsampler(lambda image, size: resize(image, size, "lanczos"))
+    monkeypatch.setattr(DetailLoss, "prepare", prepare)
+    report = adapted("mine", time_budget_s=60.0).report
+    assert len(asked) == 1 and 0 < asked[0] < 30 and report.views == "the 6 train views, 2 of them upsampled"
+    assert report.settings.steps and report.curve[-1].step > 0
 
 
 @pytest.mark.parametrize("keeps", [False, True])

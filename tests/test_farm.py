@@ -251,7 +251,14 @@ def test_workers_of_another_version_are_refused(monkeypatch, theirs, told):
         farm._refuse_other_versions(client, "farm")
 
 
-@pytest.mark.parametrize("place", ["tcp://127.0.0.1:1", "local:0", "nonsense"])
+@pytest.mark.parametrize("place", ["local:0", "local:x", "local:", "local:-1", "local:1.5"])
+def test_a_wrong_number_of_workers_is_told_at_once(tmp_path, capsys, monkeypatch, place):
+    monkeypatch.setattr("mipmap_plugin.jobs.farm.Client", None)
+    assert main(["adapt", str(tmp_path / "a.ply"), "--scale", "4", "--dask", place]) == 2
+    assert f"--dask {place}: after local: goes the number of workers, at least 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("place", ["tcp://127.0.0.1:1", "nonsense"])
 def test_a_place_without_a_scheduler_is_said_in_a_sentence(tmp_path, capsys, monkeypatch, place):
     monkeypatch.setattr("mipmap_plugin.jobs.farm.CONNECT_S", 0.5)
     assert main(["adapt", str(tmp_path / "a.ply"), "--scale", "4", "--dask", place]) == 2

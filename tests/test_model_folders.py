@@ -42,6 +42,9 @@ def test_a_folder_above_its_checkpoints_names_them(tmp_path):
             detect(tmp_path / above)
         assert str(caught.value) == f"{tmp_path / above} lies above its checkpoints; give {runs[1]} or {runs[0]}"
     write_model_folder(tmp_path / "scenes/garden")
+    adapted = write_model_folder(tmp_path / "scenes/garden_x0.25")
+    (cloud,) = adapted.glob("point_cloud/*/*.ply")
+    cloud.with_name(f"{cloud.name}.adaptation.json").write_text("{}")
     with pytest.raises(CheckpointError, match=r"scenes lies above its checkpoint; give .*garden$"):
         detect(tmp_path / "scenes")
 

@@ -16,7 +16,7 @@ from mipmap_plugin.adaptation.following import Following, release
 from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_trained, psnr_per_viewer, too_far_out
 from mipmap_plugin.adaptation.moments import at_their_moments, evaluate_moments
 from mipmap_plugin.adaptation.optimization.amount import affordable_for_model, affordable_moments, fewer_note, looks_in_budget, takes_steps
-from mipmap_plugin.adaptation.optimization.budget import no_steps_notes, plan_note, within_budget
+from mipmap_plugin.adaptation.optimization.budget import for_upsampling, no_steps_notes, plan_note, within_budget
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.growing import growth_note
 from mipmap_plugin.adaptation.optimization.loop import adapt
@@ -31,7 +31,7 @@ from mipmap_plugin.adaptation.shown import refuse_blind, remarks, showing, too_u
 from mipmap_plugin.adaptation.start.candidates import UNMATCHED, StartSearch
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
 from mipmap_plugin.adaptation.start.problem import StartProblem
-from mipmap_plugin.adaptation.target.detail import DetailLoss
+from mipmap_plugin.adaptation.target.detail import DetailLoss, unused_network
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
@@ -79,8 +79,7 @@ class Session:
         self.truth = PseudoTruth(request.images, scale, config, real)
         self.detail = DetailLoss(self.truth, scale, config) if scale > 1 and config.compare_at == "both" and config.steps else None
         if self.detail is not None:
-            self.views = evenly(self.views, config.upsampled_views)
-            self.views_note += f", {len(self.views)} of them upsampled"
+            self.views = evenly(self.views, min(config.upsampled_views, config.steps * config.views_per_step))
         truth = PseudoTruth(request.images, scale, config.model_copy(update=COMPARED_WITH_BASE if scale > 1 else {}))
         renders = [Renderer(self.backend, target) for target in self.extremes.values()]
         self.validation = Validation(steering, choosing, scale, truth, renders, config.resize)
@@ -109,12 +108,12 @@ class Session:
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
         """Adapt the base, or continue the run that `resume` holds, and return the best state."""
-        near = self.base_effects.near_plane
-        refuse_blind(self.base_views, self.base, near, self.truth, self.wanted or self.scale)
+        near, wanted = self.base_effects.near_plane, self.wanted or self.scale
+        refuse_blind(self.base_views, self.base, near, self.truth, wanted)
         if self._base_is_right:
             copy, reason = self._for_target(self.base), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
-        found = too_unlike(self.base_views), too_far_out(self.base, self.base_views, self.targets)
+        found = [too_unlike(self.base_views), too_far_out(self.base, self.base_views, self.targets), unused_network(self.config, wanted)]
         for remark in filter(None, [*remarks(self.base_views, self.base, near, orbit=self._orbits), *found]):
             warn(remark)
         began = now(self.device) - self.seconds["total"]
@@ -186,14 +185,15 @@ class Session:
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
         """Run Algorithm 1 on `student`, or continue it from the state in `resume`; return the run and what ended it."""
         renders = [Renderer(self.backend, unrounded(target)) for target in self.extremes.values()]
-        task = self._task(student, renders)
         keeper = StateKeeper(resume, self._fingerprint())
         if not any(target.sh_degree for target in self.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no viewer evaluates view-dependent color, so that these coefficients need no gradient
-        if self.detail is not None:
+        if self.detail is not None and (seconds := for_upsampling(self.config, self.seconds["total"])) > 0:
             with self.phase("upsampling"), threads.lent_to_torch():
-                self.detail.prepare(self.views)
+                self.views = self.detail.prepare(self.views, seconds)
+            self.views_note += f", {len(self.views)} of them upsampled"
             self.seconds["total"] += self.seconds["upsampling"]
+        task = self._task(student, renders)
         run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
 
         def after_step(run: Run) -> bool:

@@ -16,8 +16,7 @@ def backends(check: str | None = None, full: bool = False, json: bool = False) -
     """List the backends and why each can or cannot adapt on this machine, or check one against the reference.
 
     Args:
-        check: Run the conformance suite on the backend of this name and print a table and how many cases were run; a minute on a usual processor.
-            One that fails a case, or lacks so much that hardly any is run, ends with exit code 2.
+        check: Run the conformance suite on the backend of this name (a minute). Exit code 2 if a case fails, or if hardly any can be run.
         full: With --check: also run hundreds of random scenes; several minutes.
         json: Print JSON.
     """

@@ -68,8 +68,7 @@ def evaluate(
         upsampler: What makes base images larger: a registered name, or the file of a network.
         resize: Filter that makes base images smaller, instead of the recipe's: area aims at P1, pil-bicubic at P3.
         appearance: Appearance of test views, if training views have their own: mean of these, or upstream (of the view with the same number).
-        cameras: Cameras of the base scale, one scene or cameras.json for each checkpoint, if there are none beside it, as of lone files; may be
-            the folder of the images, if it was trained on these at their size.
+        cameras: For each checkpoint that has none: a cameras.json or a scene, such as the images' if it was trained on these at their size.
         output: Also write the rows, and notes on missing ones, as JSON to this file.
         report: Write a page that shows it all: beside `output`, or else NAME.evaluation.html in this folder, numbered if there is one already.
         overwrite: Replace files that exist.
@@ -84,7 +83,7 @@ def evaluate(
             base = Base(path, own, background, backend, screen_filter)
             wrapped, photographs = wrap(base, threads), _scene(base, folder, appearance)
             results.measure(name, wrapped, photographs, appearance, recipe, settings)
-    facts = results.write(checkpoint, output, overwrite)
+    facts = results.write(checkpoint, overwrite)
     print_json(facts) if json else results.print_tables(_title(checkpoint, images, protocol, results.judged), published)
 
 
@@ -92,7 +91,7 @@ class _Results:
     """What was measured of all checkpoints."""
 
     def __init__(self, protocol: str, perceptual: Perceptual | None, scales: list[float], page: Path | None, output: Path | None) -> None:
-        self._protocol, self._perceptual, self._scales, self._page = protocol, perceptual, scales, page
+        self._protocol, self._perceptual, self._scales, self._page, self._output = protocol, perceptual, scales, page, output
         written = output or page
         self._kept = resume_path(written) if written else None
         self._rows, self._notes, self._galleries = list[Any](), dict[str, None](), list[Any]()  # notes each once, in their order
@@ -123,7 +122,7 @@ class _Results:
         self._scenes.append(scene.source.resolve())
         self._galleries.append(gallery)
 
-    def write(self, checkpoints: Sequence[Path], output: Path | None, overwrite: bool) -> dict[str, Any]:
+    def write(self, checkpoints: Sequence[Path], overwrite: bool) -> dict[str, Any]:
         """Add the means over several scenes, write the page and the JSON as far as requested, and return what the JSON holds."""
         from mipmap_plugin.evaluation.evaluate import means
         from mipmap_plugin.evaluation.report import records
@@ -132,14 +131,14 @@ class _Results:
         facts = {"rows": records(self._rows), "judged_views": self.judged, "notes": [*self._notes], "report": self._page and str(self._page)}
         if self._page:
             write_evaluation_page(self._page, checkpoints, self._galleries, self._rows, [*self._notes], overwrite)
-        if output:
-            write_json(output, facts, overwrite)
+        if self._output:
+            write_json(self._output, facts, overwrite)
         if self._kept:
             shutil.rmtree(self._kept, ignore_errors=True)
         return facts
 
     def print_tables(self, title: str, dataset: Any) -> None:
-        """Print the rows, the published ones of a data set if one is given, the notes, and where the page is."""
+        """Print the rows, the published ones of a data set if one is given, the notes, and where the JSON and the page are."""
         from mipmap_plugin.evaluation.published import TITLE, published
         from mipmap_plugin.evaluation.report import published_table, table
 
@@ -148,6 +147,8 @@ class _Results:
             say(f"\npublished, {TITLE[dataset]}; rows of other protocols, and of bases trained at another size, are not comparable")
             rows = published(dataset, self._scales)
             say(published_table(rows) if rows else "there are none at these scales; they are at x1/2, x1/4, x1/8, x2, x4 and x8")
+        if self._output:
+            say(f"written: {self._output}")
         if self._page:
             say(look_at(self._page))
 
@@ -155,6 +156,8 @@ class _Results:
 def _perceptual(network: Literal["alex", "vgg", "vgg-01"] | None, weights: Path | None) -> Perceptual | None:
     from mipmap_plugin.evaluation.perceptual import Perceptual
 
+    if weights and not network:
+        raise SettingsError(f"--lpips-weights {weights}: say which LPIPS this is for; add --lpips alex, vgg or vgg-01")
     return Perceptual(network, weights) if network else None
 
 

@@ -164,8 +164,8 @@ def _zooms(folder: Path, manifest: dict[str, Any]) -> list[str]:
     for level in manifest["levels"]:
         ends = {"down to": level["shown_from"], "up to": level["shown_to"]}
         shown = ", ".join(f"{word} x{zoom:.3g}" for word, zoom in ends.items() if zoom is not None) or "at every zoom"
-        quality = list(level["psnr_db"].values())
-        lines.append(f"  {level['file']}  x{level['scale']:.3g}, shown {shown}: {min(quality):.1f} to {max(quality):.1f} dB, {_size(level)}")
+        quality = " to ".join(dict.fromkeys(f"{of(level['psnr_db'].values()):.1f}" for of in (min, max)))
+        lines.append(f"  {level['file']}  x{level['scale']:.3g}, shown {shown}: {quality} dB, {_size(level)}")
     return lines
 
 

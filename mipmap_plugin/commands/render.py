@@ -57,8 +57,7 @@ def render(
         view: Name of a view; may be given several times. By default all test views, or all if there are none.
         time: Moment of a moving scene, 0 to 1, in place of those of the views; given several times: each view at each moment.
         screen_filter: trained: the filter of the checkpoint's training; scaled: the training-free filter for this scale.
-        viewer: Render as this viewer does: classic, spark, playcanvas (or supersplat), ... By default the one that the file was adapted for,
-            unless a screen filter is given. An unknown name lists all viewers.
+        viewer: Render as this viewer (an unknown name lists all): classic, spark, ... By default the file's own, unless a screen filter is given.
         supersampling: N for N x N samples per pixel. The screen filter keeps its size: the exact picture of a zoom-out needs scaled, too.
         filter_3d: Smooth every splat to the finest detail that the cameras could resolve, as Mip-Splatting's 3D filter does.
         depth: Also write NAME_depth.npy, [height, width] float32: world units along the optical axis, 0 where there is nothing.

@@ -18,6 +18,7 @@ from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.recipes import recipe as make_config
 
 if TYPE_CHECKING:
+    from mipmap_plugin.evaluation.tradeoff.files import Folder
     from mipmap_plugin.evaluation.tradeoff.front import Tradeoff
     from mipmap_plugin.evaluation.tradeoff.points import Plan
     from mipmap_plugin.wrap import Wrapped
@@ -82,7 +83,7 @@ def tradeoff(
     _check(model, plan, scale)
     with resumable(output / KEPT, "cell"):
         tradeoffs = run(model, photographs, unique_scales(scale), plan, views, folder)
-    _print(tradeoffs, write_tradeoff_page(page, checkpoint, model, tradeoffs, overwrite), json)
+    _print(tradeoffs, folder, write_tradeoff_page(page, checkpoint, model, tradeoffs, overwrite), json)
 
 
 def _check(model: Wrapped, plan: Plan, scales: Sequence[float]) -> None:
@@ -93,11 +94,12 @@ def _check(model: Wrapped, plan: Plan, scales: Sequence[float]) -> None:
         make_config(name, factor, **without_none(seed=seed, steps=steps))
 
 
-def _print(tradeoffs: Sequence[Tradeoff], page: Path | None, json: bool) -> None:
+def _print(tradeoffs: Sequence[Tradeoff], folder: Folder, page: Path | None, json: bool) -> None:
     from mipmap_plugin.evaluation.tradeoff.files import facts, table
 
     if json:
         return print_json(facts(tradeoffs, complete=True))
     say("\n\n".join(table(tradeoff) for tradeoff in tradeoffs))
+    say(f"written: {', '.join(str(file) for file in folder.files)}")
     if page:
         say(look_at(page))

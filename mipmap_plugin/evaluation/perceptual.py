@@ -53,6 +53,8 @@ class Perceptual:
 
 def _load(backbone: str, file: Path | None) -> nn.Module:
     """The lpips network with the backbone's weights from a file, or downloaded."""
+    if file is not None and file.is_dir():
+        raise CheckpointError(f"{file} is a folder; give the file of the weights of {backbone} in it")
     with torchvision_optional(models={"alexnet": _alexnet, "vgg16": _vgg16}):
         try:
             import lpips

@@ -179,10 +179,12 @@ def _outcome(future: Future[Outcome | Delivery], job: Job) -> Outcome:
 @contextmanager
 def _connected(place: str) -> Iterator[Client]:
     """A client of the scheduler at `place`, or of a new one on this machine."""
-    if match := re.fullmatch(r"local:([1-9]\d*)", place):
+    if place.startswith("local:"):
+        if not re.fullmatch(r"local:0*[1-9]\d*", place):
+            raise SettingsError(f"--dask {place}: after local: goes the number of workers, at least 1; give local:4 for four workers here")
         with _without_interrupts(), dask.config.set(LOCAL):
             cluster = LocalCluster(
-                n_workers=int(match[1]), threads_per_worker=1, memory_limit=0, dashboard_address=":0", silence_logs=logging.CRITICAL
+                n_workers=int(place[6:]), threads_per_worker=1, memory_limit=0, dashboard_address=":0", silence_logs=logging.CRITICAL
             )
         with cluster, Client(cluster) as client:
             yield client

@@ -195,7 +195,10 @@ def _instead(folder: Path) -> str:
 
 
 def _below(folder: Path) -> list[Path]:
-    """The model folders at most DEPTH levels below a folder, as far as they are found among MOST_LOOKED_AT folders; the newest names first."""
+    """The model folders at most DEPTH levels below a folder, as far as they are found among MOST_LOOKED_AT folders; the newest names first.
+
+    Without adaptations, where there is a base.
+    """
     level, looked_at, found = [folder], 0, list[Path]()
     for _ in range(DEPTH):
         below = [each for parent in level for each in _folders_in(parent)][: MOST_LOOKED_AT - looked_at]
@@ -203,7 +206,12 @@ def _below(folder: Path) -> list[Path]:
         holding = [each for each in below if _is_whole(each)]
         found += sorted(holding, reverse=True)
         level = [each for each in below if each not in holding]
-    return found
+    return [each for each in found if not _was_adapted(each)] or found
+
+
+def _was_adapted(folder: Path) -> bool:
+    """Whether a model folder has the report of an adaptation beside its checkpoint."""
+    return any(True for place in ("*", "point_cloud/*") for _ in folder.glob(f"{place}/*{REPORT}"))
 
 
 def _is_whole(folder: Path) -> bool:

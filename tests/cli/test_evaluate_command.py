@@ -26,6 +26,7 @@ def test_evaluate_prints_a_table_and_writes_its_rows(run, model_folder, tmp_path
     code, out, _ = run(*words)
     assert code == 0
     assert "truth: P1" in out and "real dB over 2 views\n" in out and "| x1 " in out and "| x0.25 " in out and "base, resized" in out
+    assert out.endswith(f"\nwritten: {tmp_path / 'rows.json'}\npage: {tmp_path / 'rows.html'}\n")
     assert "instant, 1 of 2 judged views adapted to" in out  # of the folder's cameras, one is judged
     written = json.loads((tmp_path / "rows.json").read_text())
     rows = written["rows"]
@@ -171,6 +172,9 @@ def test_evaluate_refuses_what_cannot_be_judged(run, model_folder, tmp_path):
     refused(run("evaluate", tiny.ply(tmp_path / "a.ply"), "--images", scene, "--scale", "1"), "has no cameras, so its base scale is not known")
     refused(run("evaluate", model_folder, "--images", scene, "--scale", "4"), "the photographs have only 32 x 24")
     refused(run("evaluate", model_folder, "--images", tmp_path / "nowhere", "--scale", "1"), "there is no such file or folder")
+    lpips = "evaluate", model_folder, "--images", scene, "--scale", "1", "--lpips-weights", tmp_path
+    refused(run(*lpips), f"--lpips-weights {tmp_path}: say which LPIPS this is for; add --lpips alex, vgg or vgg-01")
+    refused(run(*lpips, "--lpips", "alex"), f"{tmp_path} is a folder; give the file of the weights of alex in it")
 
 
 def test_a_checkpoint_of_which_nothing_is_drawn_is_refused_before_the_work(run, tmp_path):

@@ -10,6 +10,7 @@ import pytest
 import tiny
 from commands_run import NO_STEP, QUICK, refused
 
+from mipmap_plugin.cli import COMMANDS
 from mipmap_plugin.commands.types import read_scale
 
 pytestmark = pytest.mark.usefixtures("few_views")
@@ -24,6 +25,12 @@ def refused_once_named(answer, *words):
 
 def test_the_version(run):
     assert re.fullmatch(r"mipmap-plugin \d+\.\d+\.\d+\S*\n", run("--version")[1])
+
+
+@pytest.mark.parametrize("command", COMMANDS.values())
+def test_the_help_of_an_option_is_one_paragraph(command):
+    """A second line of a docstring would begin a new line of the help, in the middle of a sentence."""
+    assert re.findall(r"^ {12}.*", command.__doc__, re.MULTILINE) == []
 
 
 def malformed(folder: Path) -> dict[str, Path]:

@@ -121,6 +121,7 @@ def test_cameras_of_each_scene(run, tmp_path):
         ("a.ply b.ply --scale 4 --threads 0", "mipmap-plugin: --threads must be at least 1, got 0\n"),
         ("a.ply b.ply --scale 4 --jobs 2 --dask local:2", "leave one of them out"),
         ("a.ply --scale 4 --send-files", "--send-files sends them to the workers of --dask"),
+        ("a.ply b.ply --scale 4 --jobs 2 --send-files", "--send-files sends them to the workers of --dask"),
         ("x/a.ply y/a.ply --scale 4 --output new", "would both be written to"),
         ("*.spz --scale 4", "no file or folder fits this pattern"),
         ("--list nowhere.txt --scale 4", "nowhere.txt: No such file"),

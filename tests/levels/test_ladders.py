@@ -168,6 +168,8 @@ def test_the_command_makes_a_ladder_and_prints_it(tmp_path, capsys):
     said = capsys.readouterr().out
     print_summary(tmp_path, manifest | {"levels": manifest["levels"][:1]})
     assert capsys.readouterr().out.startswith(f"{tmp_path}, for antialiased: 1 level\n")
+    print_summary(tmp_path, manifest | {"levels": [manifest["levels"][0] | {"psnr_db": {"1": 27.53, "0.5": 27.46}}]})
+    assert ": 27.5 dB, " in capsys.readouterr().out
     assert "2 levels" in said and "level_1.ply  x0.5, shown up to" in said and "at worst" in said
     assert not state_path(tmp_path / "ladder").exists() and not (tmp_path / "ladder" / "report.html").exists()
     assert cli.main(words) == 2 and "--overwrite" in capsys.readouterr().err

@@ -228,9 +228,16 @@ def test_scale_one_has_nothing_to_trade(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("wrong", [dict(repeats=0), dict(repeats=10**11), dict(supersampling=(1,))])
-def test_a_plan_that_cannot_be_is_refused(wrong):
-    with pytest.raises(SettingsError, match="repeats must be 1 to 1000"):
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        (dict(repeats=0), "repeats must be 1 to 1000, got 0"),
+        (dict(repeats=10**11), "repeats must be 1 to 1000, got 100000000000"),
+        (dict(supersampling=(4, 1)), "supersampling must be at least 2, for 2 x 2 samples a pixel, got 1"),
+    ],
+)
+def test_a_plan_that_cannot_be_is_refused(wrong, told):
+    with pytest.raises(SettingsError, match=f"^{told}$"):
         Plan(**wrong)
 
 

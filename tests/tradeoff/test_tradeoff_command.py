@@ -27,6 +27,7 @@ def test_the_command_prints_a_table_and_refuses_to_replace_it(tmp_path, capsys):
     assert command(tmp_path) == 0
     out = capsys.readouterr().out
     assert "x0.25, dB against the base supersampled 4 x 4 (no photographs)" in out and "| base  " in out
+    assert out.endswith(f"\nwritten: {tmp_path / 'new' / 'tradeoff.json'}, {tmp_path / 'new' / 'tradeoff.csv'}\n")
     assert command(tmp_path) == 2
     assert "exists already" in capsys.readouterr().err
     assert command(tmp_path, "--overwrite", "--json") == 0

@@ -98,6 +98,11 @@ class Pace:
         return max(1, bisect_right(range(1, most + 1), SPARE * seconds, key=needed)) if follow.moments else most
 
 
+def for_upsampling(config: AdaptConfig, spent: float) -> float:
+    """Seconds that a network may take for a run's views: half of what a time budget has left after so many seconds, the rest being for steps."""
+    return math.inf if config.time_budget_s is None else (config.time_budget_s - spent) / 2
+
+
 def most_of(config: AdaptConfig) -> int:
     """The number of steps in a time budget that has room for them."""
     return max(config.steps, config.most_steps or 0)

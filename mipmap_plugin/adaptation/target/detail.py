@@ -15,12 +15,15 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from mipmap_plugin.adaptation.spreading import Halves, places, spread
 from mipmap_plugin.adaptation.target.image_store import moved_off_full_gpu
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.structure import similarity
 from mipmap_plugin.adaptation.target.upsamplers import find_upsampler
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.process.clock import now
+from mipmap_plugin.recipes import INTERPOLATIONS
 
 # Iterations of back-projection: the first improves a GAN's image by 1.4 dB (lego at x2), two more by another 0.2.
 ROUNDS = 3
@@ -33,6 +36,14 @@ TRUST = 0.05
 CONTRAST_POWER = 3
 
 
+def unused_network(config: AdaptConfig, scale: float) -> str | None:
+    """That a network was given which this adaptation does not use, and why; None if it is used, or if there is none."""
+    if config.upsampler in INTERPOLATIONS or (scale > 1 and config.steps and config.compare_at != "base"):
+        return None
+    taken = f"recipe {config.recipe} takes no steps" if not config.steps else f"compare_at is {config.compare_at}"
+    return f"the upsampler {config.upsampler} is not used, because {taken if scale > 1 else f'x{scale:g} is no zoom-in'}"
+
+
 class DetailLoss:
     """The loss of an image of the new scale against the upsampled base; each view is upsampled once."""
 
@@ -42,10 +53,20 @@ class DetailLoss:
         self._enlarge = find_upsampler(config.upsampler)
         self._targets: dict[Camera, tuple[Tensor, Tensor]] = {}
 
-    def prepare(self, views: Sequence[Camera]) -> None:
-        """Upsample the views beforehand, which may take seconds for each."""
-        for view in tqdm(views, disable=None, desc=f"upsampling x{self._scale:g}", unit="view"):
-            self._target(view)
+    def prepare(self, views: Sequence[Camera], seconds: float) -> list[Camera]:
+        """Upsample the views beforehand, as many as are expected to take so many seconds, and at least one; return those, in their order.
+
+        Each may take seconds. If there is no time for all, those that are upsampled look from all sides.
+        """
+        order = spread(Halves.of(range(len(views)), places(views)), torch.Generator().manual_seed(self._config.seed))
+        device, done = self._truth(views[order[0]]).device, []
+        began = now(device)
+        for number in tqdm(order, disable=None, desc=f"upsampling x{self._scale:g}", unit="view"):
+            self._target(views[number])
+            done.append(number)
+            if (now(device) - began) * (len(done) + 1) / len(done) > seconds:
+                break
+        return [views[number] for number in sorted(done)]
 
     def __call__(self, view: Camera, image: Tensor) -> Tensor:
         """Return the loss of `image` [H, W, 3], the render of a view of the base scale at the new scale."""

@@ -49,6 +49,11 @@ class Folder:
     picture: bool  # whether to write the plot
     overwrite: bool
 
+    @property
+    def files(self) -> list[Path]:
+        """The JSON, the CSV and, if it is to be drawn, the plot."""
+        return [self.path / name for name in NAMES[: None if self.picture else -1]]
+
 
 def goes_on(folder: Folder) -> Folder:
     """The folder, whose results are replaced if they are those of an interrupted command, which are incomplete."""

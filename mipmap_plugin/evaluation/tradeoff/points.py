@@ -67,5 +67,7 @@ class Plan:
     viewer: str | None = None  # what files are adapted for, and the base is also rendered as
 
     def __post_init__(self) -> None:
-        if not 1 <= self.repeats <= MOST_REPEATS or any(n < 2 for n in self.supersampling):
-            raise SettingsError(f"repeats must be 1 to {MOST_REPEATS}, and supersampling at least 2")
+        if not 1 <= self.repeats <= MOST_REPEATS:
+            raise SettingsError(f"repeats must be 1 to {MOST_REPEATS}, got {self.repeats}")
+        if (least := min(self.supersampling, default=2)) < 2:
+            raise SettingsError(f"supersampling must be at least 2, for 2 x 2 samples a pixel, got {least}")
