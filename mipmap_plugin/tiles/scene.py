@@ -70,7 +70,7 @@ class TiledScene:
         self.wrapped.targets(viewer)  # raises for what no viewer draws
         self.target = self.wrapped.effects(viewer=viewer)  # the sample does not tell whether splats that another near plane shows are in view
         self.backend, self.backend_note = self._backend(base.backend)
-        self.asked_steps, self.config = config.steps, self._affordable(config)
+        self.asked_steps, self.config = config.steps, self._affordable(config, scale)
 
     def _wrapped(self, base: Base, sample: Tensor) -> Wrapped:
         """Some of the splats with the cameras of all."""
@@ -87,9 +87,9 @@ class TiledScene:
         splats = self.wrapped.model.gaussians(self.wrapped.any_camera())
         return choose_backend(name, Needs.of(splats, self.base_effects, gradients=True), Needs.of(splats, self.target, gradients=True))
 
-    def _affordable(self, config: AdaptConfig) -> AdaptConfig:
+    def _affordable(self, config: AdaptConfig, scale: float) -> AdaptConfig:
         """The settings with no more steps than a scene of this size can have, as without tiles."""
-        config = fitting(config, self.base_effects)
+        config = fitting(config, self.base_effects, self.wrapped.cameras, scale)
         return affordable_for(config, self.base.places[:, :3], self.wrapped.cameras, self.target.near_plane)
 
     @cached_property
@@ -136,7 +136,7 @@ class TiledScene:
     def at(self, scale: float, config: AdaptConfig, folder: Path) -> TiledScene:
         """The same scene at another scale, for its truths only: its views, and the base that they show. It shares this one's memory."""
         other = copy(self)
-        other.scale, other.config, other.folder = scale, self._affordable(config), folder
+        other.scale, other.config, other.folder = scale, self._affordable(config, scale), folder
         for name in ("views", "sweeps", "used_views"):
             other.__dict__.pop(name, None)
         return other
