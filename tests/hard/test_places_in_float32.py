@@ -15,6 +15,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.screen_filters import USUAL_EPS2D
+from mipmap_plugin.splatting.precision import finest
 
 BACKENDS = ["reference", "cpu"] if importlib.util.find_spec("numba") else ["reference"]
 
@@ -72,3 +73,7 @@ def test_depths_far_from_the_origin_equal_those_in_float64():
     one, two = (geometry.depth(get_backend("reference"), g, case.camera, case.effects) for g in (single, single.to(dtype=torch.float64)))
     assert one.dtype == torch.float32
     torch.testing.assert_close(one.double(), two, rtol=1e-5, atol=1e-5)
+
+
+def test_a_device_without_float64_places_splats_in_float32():
+    assert [finest(torch.device(name)) for name in ("cpu", "cuda", "mps")] == [torch.float64, torch.float64, torch.float32]
