@@ -64,7 +64,8 @@ class AdaptConfig(BaseModel):
         default=(1.0, 1.0), description="Zoom-out: the file is shown at zooms from the first to the second of these multiples of its scale."
     )
     resize: ResizeFilter = Field(
-        default="pil-bicubic", description="Filter that shrinks images, such as a protocol's; `fitting`: the one that fits the base's own filter."
+        default="pil-bicubic",
+        description="Filter that shrinks images, such as a protocol's; `fitting`: the one that fits the base's own filter and the pictures' width.",
     )
     upsampler: str = Field(default="bicubic", description="What makes base images larger: a registered name, or the file of a network.")
     compare_at: Literal["target", "base", "both"] = Field(

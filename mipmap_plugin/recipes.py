@@ -58,7 +58,7 @@ CRISPNESS_IN_BUDGET = 0.5
 # In a time budget with room for more, 720 steps gain 0.6 dB on lego at x1/4, and 1440 1.2 dB.
 DEFAULT_OUT = dict(
     steps=360, most_steps=2500, most_draws=MOST_DRAWS, loss="psnr", decay=0.02, betas=(0.9, 0.95), nesterov=True, truth_oversampling=4,
-    views_per_step=4, order="spread", gathering=0.25, warm_up=0.1, extra_views=150,
+    views_per_step=4, order="spread", gathering=0.25, warm_up=0.1, extra_views=150, resize="fitting",
 )  # fmt: skip
 RATES_OUT = LearningRates(
     means=0.1, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.04, offsets=0.1, features=0.05, networks=5e-3
@@ -102,7 +102,7 @@ def paper(scale: float, network: bool) -> dict[str, Any]:
 
 def instant(scale: float, network: bool) -> dict[str, Any]:
     """The closed form alone, without optimization: seconds."""
-    return dict(steps=0)
+    return dict(steps=0, resize="fitting") if scale <= 1 else dict(steps=0)
 
 
 RECIPES = Registry("mipmap_plugin.recipes", {name: f"mipmap_plugin.recipes:{name}" for name in ("default", "thorough", "paper", "instant")})

@@ -111,6 +111,15 @@ def test_degree_four_is_orthonormal():
     assert (gram - torch.eye(25)).abs().max() < 0.03  # Monte Carlo noise of 200 000 directions
 
 
+@pytest.mark.parametrize("alone", range(5))
+def test_where_nothing_is_drawn_any_parameter_alone_has_a_gradient_of_zero(alone):
+    means, *others = (tensor.detach() for tensor in leaves(gaussians(3))[0])
+    tensors = [means * torch.tensor([1.0, 1.0, -1.0]), *others]  # behind the camera
+    tensors[alone].requires_grad_()
+    rendered = BACKEND.render(Gaussians(*tensors), camera(), Effects(1))
+    assert not torch.autograd.grad(rendered.image.sum() + rendered.alpha.sum(), tensors[alone])[0].any()
+
+
 def t2_camera() -> Camera:
     rows = [[0.726315789, -0.610526316, -0.315789474, 0.5], [0.526315789, 0.789473684, -0.315789474, -0.25],
             [0.442105263, 0.063157895, 0.894736842, 4.0], [0, 0, 0, 1]]  # fmt: skip

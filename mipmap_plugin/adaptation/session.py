@@ -63,13 +63,13 @@ class Session:
         self.request, self.scale, self.targets, self.finer = request, scale, request.targets, request.finer
         self.base, self.backend, self.base_effects = request.images.model, request.images.backend, request.images.effects
         self.effects, self.extremes = next(iter(self.targets.values())), extreme_targets(self.targets)
-        self.asked = fitting(config, self.base_effects)
-        self.config = config = affordable_for_model(self.asked, self.base, cameras, self.effects.near_plane)
+        self.asked, self.config = config, affordable_for_model(config, self.base, cameras, self.effects.near_plane)
         self.device = self.base.parameters()["means"].device
-        self.viewpoints = replace(request.viewpoints, looks=looks_in_budget(config, self.base))
+        self.viewpoints = replace(request.viewpoints, looks=looks_in_budget(self.config, self.base))
         self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.device)
         self._has_photographs, self._orbits = real is not None, not cameras or config.views == "orbit"
         self.base_views, validation, self.views_note = self._choose_views(cameras)
+        self.config = config = fitting(self.config, self.base_effects, self.base_views, scale)
         self.seconds["total"] = sum(self.seconds.values())
         self._closest_of = cameras if scale > 1 and cameras else self.base_views  # a zoom-in is as fine as what the base was seen from
         self.views = over_band(self.base_views, config)

@@ -19,6 +19,7 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.eigen import eigh3
 from mipmap_plugin.splatting.harmonics import C0
+from mipmap_plugin.splatting.precision import exact
 from mipmap_plugin.splatting.rotations import rotations
 
 
@@ -30,7 +31,8 @@ def with_outputs(rendered: Rendered, backend: Backend, gaussians: Gaussians, cam
 
 def depth(backend: Backend, gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor:
     """Depth along the optical axis, [H, W] world units: the mean of the splats' centers, weighted as in the image; 0 where there is no splat."""
-    depths = (gaussians.means - camera.center.to(gaussians.means)) @ camera.viewmat[2, :3].to(gaussians.means)
+    means = exact(gaussians).means
+    depths = ((means - camera.center.to(means)) @ camera.viewmat[2, :3].to(means)).to(gaussians.means)
     unit = effects.near_plane or 1.0  # in this unit every depth that is drawn exceeds 1, so that the 0.5 of SH colors costs no digits
     colors = torch.stack([depths / unit, torch.ones_like(depths), torch.ones_like(depths)], -1)
     summed, weight, _ = _blended(backend, gaussians, colors, camera, effects).image.unbind(-1)

@@ -13,6 +13,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.harmonics import C0, colors
+from mipmap_plugin.splatting.precision import exact
 
 # sRGB (IEC 61966-2-1): up to here it is a line, and from here on a power of a scaled and shifted value.
 LINE_ENDS, SLOPE, SHIFT, POWER = 0.0031308, 12.92, 0.055, 2.4
@@ -25,7 +26,8 @@ def in_linear_light(render: Callable[[Gaussians, Camera, Effects], Rendered], ga
     # Before the colors, whose derivative in a row with NaN is NaN. Such rows are not drawn.
     finite = gaussians.means.isfinite().all(1) & gaussians.sh.isfinite().flatten(1).all(1)
     gaussians = gaussians if finite.all() else gaussians[finite.nonzero()[:, 0]]
-    shown = colors(gaussians.sh, gaussians.means, camera.center.to(gaussians.means), min(effects.sh_degree, gaussians.sh_degree))
+    means = exact(gaussians).means
+    shown = colors(gaussians.sh, means, camera.center.to(means), min(effects.sh_degree, gaussians.sh_degree))
     splats = replace(gaussians, sh=((shown**power - 0.5) / C0)[:, None])
     plain = replace(effects.settings, linear_light=None)
     red, green, blue = map(_linear, effects.background)

@@ -1,8 +1,14 @@
-"""The reference backend: readable, pure torch, on any device, in float32 or float64, with exact gradients."""
+"""The reference backend: readable, pure torch, on any device, in float32 or float64, with exact gradients.
+
+Splats are placed and shaped in float64 and blended in their own dtype: what is computed per splat takes little of the time, and where numbers are
+large and cancel; what is computed per pixel takes most of it, of numbers that are near 1.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,6 +26,7 @@ from mipmap_plugin.splatting.filters import Footprint, footprint
 from mipmap_plugin.splatting.harmonics import colors
 from mipmap_plugin.splatting.packing import packed, round_to
 from mipmap_plugin.splatting.pixel_integral import PixelIntegral
+from mipmap_plugin.splatting.precision import exact
 from mipmap_plugin.splatting.projection import Projected, project
 from mipmap_plugin.splatting.surfels import Surfels, surfels
 from mipmap_plugin.splatting.window import WindowIntegral
@@ -48,9 +55,10 @@ class ReferenceBackend:
         with torch.no_grad():
             rows = drawn_rows(gaussians, camera, effects, ranks)
         gaussians = gaussians[rows]
-        projected, footprints = _footprints(gaussians, camera, effects)
+        wide = exact(gaussians)
+        projected, footprints = _footprints(wide, camera, effects, gaussians.means.dtype)
         degree = min(effects.sh_degree, gaussians.sh_degree)
-        rgb = colors(gaussians.sh, gaussians.means, camera.center.to(gaussians.means), degree)
+        rgb = colors(gaussians.sh, wide.means, camera.center.to(wide.means), degree)
         if settings.max_color is not None:
             rgb = rgb.clamp_max(settings.max_color)
         if settings.color_steps is not None:
@@ -58,7 +66,7 @@ class ReferenceBackend:
         least = least_alpha(footprints, settings)
         by_splat = independent(footprints.alpha, settings.max_alpha, settings.culls)
         alphas, memory = (footprints.alphas, footprints.MEMORY_FACTOR) if isinstance(footprints, WindowIntegral) else (by_splat, 1)
-        splats = SortedSplats(projected.means2d, footprints.packed(), rgb, least, alphas, memory)
+        splats = SortedSplats(projected.means2d.to(rgb), footprints.packed(), rgb, least, alphas, memory)
         image, transmittance = composite(splats, footprints.extents(least), camera, settings, rgb.new_tensor(effects.background))
         return Rendered(image, 1 - transmittance)
 
@@ -68,7 +76,8 @@ def drawn_rows(gaussians: Gaussians, camera: Camera, effects: Effects, ranks: Te
 
     Computed first and without gradients, so that splats that are not drawn, even NaN, are not part of any gradient.
     """
-    projected, footprints = _footprints(gaussians, camera, effects)
+    wide = exact(gaussians)
+    projected, footprints = _footprints(wide, camera, effects, gaussians.means.dtype)
     least = least_alpha(footprints, effects.settings)
     half = footprints.extents(least)
     low, high = projected.means2d - half, projected.means2d + half
@@ -77,7 +86,7 @@ def drawn_rows(gaussians: Gaussians, camera: Camera, effects: Effects, ranks: Te
         inside &= (2 * projected.means2d / low.new_tensor([camera.width, camera.height]) - 1).abs().amax(1) <= effects.settings.frame
     drawn = finite_rows(gaussians) & (projected.depths > effects.near_plane) & footprints.visible(least) & inside
     rows = drawn.nonzero()[:, 0]
-    keys = (gaussians.means - camera.center.to(gaussians.means)).norm(dim=1) if effects.settings.radial else projected.depths
+    keys = (wide.means - camera.center.to(wide.means)).norm(dim=1) if effects.settings.radial else projected.depths
     keys = keys if ranks is None else ranks
     return rows[keys[rows].argsort(stable=True)]
 
@@ -102,9 +111,16 @@ def least_alpha(footprints: Footprint | PixelIntegral | Surfels, settings: Rende
     return (footprints.alpha(parameters, zero, zero) * math.exp(-(settings.radius**2) / 2)).clamp_min(settings.min_alpha)
 
 
-def _footprints(gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[Projected, Footprint | PixelIntegral | Surfels]:
+def _footprints(
+    gaussians: Gaussians, camera: Camera, effects: Effects, dtype: torch.dtype
+) -> tuple[Projected, Footprint | PixelIntegral | Surfels]:
+    """The projection in the dtype of `gaussians`, and the footprints in `dtype`."""
+    footprints: Footprint | PixelIntegral | Surfels
     if effects.screen_filter == SURFEL:
-        return surfels(gaussians, camera, effects)
-    projected = project(gaussians, camera, effects.near_plane, effects.settings)
-    most = effects.settings.max_variance(camera.width, camera.height)
-    return projected, footprint(projected, gaussians.opacities, effects.screen_filter, effects.eps2d, effects.settings, most)
+        projected, footprints = surfels(gaussians, camera, effects)
+    else:
+        projected = project(gaussians, camera, effects.near_plane, effects.settings)
+        most = effects.settings.max_variance(camera.width, camera.height)
+        footprints = footprint(projected, gaussians.opacities, effects.screen_filter, effects.eps2d, effects.settings, most)
+    rounded: dict[str, Any] = {name: value.to(dtype) for name, value in vars(footprints).items() if isinstance(value, Tensor)}
+    return projected, replace(footprints, **rounded)

@@ -30,8 +30,9 @@ def _other_filters(protocol: Protocol, scales: Sequence[float], recipes: Sequenc
     same = {"box": "area"}.get(truth, truth)  # means of whole blocks, and of any
     for name, scale in product(recipes, scales):
         config = config_of(name, scale, settings)
-        if scale < 1 and most_steps(name, scale, config.steps) and config.resize not in (truth, same):
-            used[name] = config.resize
+        own = "pil-bicubic" if config.resize == "fitting" else config.resize  # as it is for all but the narrowest pictures
+        if scale < 1 and most_steps(name, scale, config.steps) and own not in (truth, same):
+            used[name] = own
     others = ", ".join(f"{name} ({own})" for name, own in used.items())
     aimed = f"--resize {same} adapts to images that are made as the truth is"
     return [f"{protocol.name} makes photographs smaller by another filter ({truth}) than base images are for {others}; {aimed}"] if others else []

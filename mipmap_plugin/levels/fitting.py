@@ -27,8 +27,9 @@ SIZE = re.compile(r"([0-9.]+)\s*([a-z]*)", re.IGNORECASE)
 # Compressed files have a few percent more bytes per splat where splats are fewer.
 COMPRESSED_MARGIN = 0.9
 
-# Bytes that a PLY's header may have beyond what is known of it before the run: digits of the scale and of settings that follow from it, the hash of
-# photographs, the tag of the viewer's filter and its dilation. All together they have 210 at most, and a splat has 68 to 248.
+# Bytes that a PLY's header may have beyond what is known of it before the run: digits of the scale and of settings that follow from it, the name of
+# the filter that fits, the hash of photographs, the tag of the viewer's filter and its dilation. All together they have 214 at most, and a splat
+# has 68 to 248.
 UNKNOWN = 256
 
 # Bytes kept for what a file of another project has besides its splats: a torch archive's own, and comments.

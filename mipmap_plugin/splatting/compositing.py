@@ -59,8 +59,9 @@ def composite(
     tile = settings.tile
     tiles_x, tiles_y = -(-camera.width // tile), -(-camera.height // tile)
     starts, members = bin_tiles(splats.means2d, extents, tiles_x, tiles_y, tile)
-    # The empty sum connects the image to the splats in the gradient graph, so that where none is drawn the gradient is 0 and not an error.
-    color = splats.colors[:0].sum() + splats.colors.new_zeros(tiles_x * tiles_y, tile**2, 3)
+    # Empty sums connect the image to the splats in the gradient graph, so that where none is drawn the gradient is 0 and not an error.
+    nothing = splats.colors[:0].sum() + splats.means2d[:0].sum() + splats.footprints[:0].sum()
+    color = nothing + splats.colors.new_zeros(tiles_x * tiles_y, tile**2, 3)
     transmittance = splats.colors.new_ones(tiles_x * tiles_y, tile**2)
     background = splats.colors.new_zeros(3) if background is None else background
     rounded = background.expand(tiles_x * tiles_y, tile**2, 3)

@@ -41,7 +41,10 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def colors(sh: Tensor, means: Tensor, eye: Tensor, degree: int) -> Tensor:
-    """Linear RGB [N, 3] of splats at `means` [N, 3] seen from `eye` [3]: SH + 0.5, clamped to at least 0, no upper bound."""
+    """Linear RGB [N, 3] of splats at `means` [N, 3] seen from `eye` [3]: SH + 0.5, clamped to at least 0, no upper bound.
+
+    In the dtype of `sh`; `means` and `eye` may be in a finer one, in which far from the origin the directions are as exact as elsewhere.
+    """
     if degree == 0:  # independent of the direction
         return (C0 * sh[:, 0]).add(0.5).clamp_min(0)
     bands = (degree + 1) ** 2
@@ -50,7 +53,7 @@ def colors(sh: Tensor, means: Tensor, eye: Tensor, degree: int) -> Tensor:
     length = rays.norm(dim=-1, keepdim=True)
     at_eye = length == 0
     directions = torch.where(at_eye, rays.new_tensor([0.0, 0.0, 1.0]), rays / torch.where(at_eye, 1.0, length))
-    return (basis(directions, degree)[..., None] * sh[:, :bands]).sum(1).add(0.5).clamp_min(0)
+    return (basis(directions.to(sh), degree)[..., None] * sh[:, :bands]).sum(1).add(0.5).clamp_min(0)
 
 
 def rotated(sh: Tensor, rotation: Tensor) -> Tensor:

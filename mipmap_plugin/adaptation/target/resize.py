@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 from torch import Tensor
 
 from mipmap_plugin.adaptation.target.resampling import resample, resample_back
+from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.splatting.filters import compensates
+
+# px: a bicubic filter weighs what lies up to a new pixel from the middle of each, which the border of a picture of this width cuts off everywhere.
+# What is left counts the middle of the picture too much: adaptation to it lost 3 to 14 dB of the start's at 1 and 2 px, and gains from 3 px on.
+TOO_NARROW = 2
 
 
 def resize(image: Tensor, size: tuple[int, int], method: str) -> Tensor:
@@ -43,15 +51,18 @@ def _check_box(image: Tensor, size: tuple[int, int]) -> None:
         raise SettingsError(f"box: {old} px is not a whole multiple of {list(size)} px; use area")
 
 
-def fitting(config: AdaptConfig, base: Effects) -> AdaptConfig:
+def fitting(config: AdaptConfig, base: Effects, views: Sequence[Camera], scale: float) -> AdaptConfig:
     """The settings with the filter that fits a base which is rendered with these effects, where they leave the choice of one.
 
-    A base whose screen filter stands for the area of a pixel shows means over that area. For one that is sampled at the pixel's center a bicubic
-    filter is better, by up to 0.5 dB (docs/recipes_found.md).
+    Where the `views`, which are of the base scale, are narrow at `scale`, that is the mean over the area of a pixel. So it is at a zoom-in from a
+    base whose screen filter stands for that area: for one that is sampled at the pixel's center a bicubic filter is better, by up to 0.5 dB
+    (docs/recipes_found.md). A zoom-out looks like other pictures of its size, which mostly are made by a bicubic filter.
     """
     if config.resize != "fitting":
         return config
-    return config.model_copy(update={"resize": "area" if compensates(base.screen_filter) else "pil-bicubic"})
+    narrow = max((min(view.zoomed(min(1.0, scale)).size) for view in views), default=math.inf) <= TOO_NARROW
+    averages = narrow or (scale > 1 and compensates(base.screen_filter))
+    return config.model_copy(update={"resize": "area" if averages else "pil-bicubic"})
 
 
 def difference_from(target: Tensor, image: Tensor, method: str) -> Tensor:

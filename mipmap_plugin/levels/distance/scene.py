@@ -74,7 +74,8 @@ class Scene:
     def config(self, level: int) -> AdaptConfig:
         """The settings of a level. Nothing is pruned, so that the rows of the finer level, which come first, keep their places."""
         config = affordable_for(self.asked(level), self.splats.means, self.views, self.target.near_plane)
-        return fitting(config, self.base.effects()).model_copy(update={"prune_every": max(1, config.steps)})
+        config = fitting(config, self.base.effects(), self.views, self.scale(level))
+        return config.model_copy(update={"prune_every": max(1, config.steps)})
 
     def asked(self, level: int) -> AdaptConfig:
         """The settings of a level, before the size of the scene reduces its steps (`config`)."""
