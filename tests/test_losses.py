@@ -39,10 +39,11 @@ def test_an_image_that_is_right_has_no_gradient():
     assert not gradient.any() and square_error == 0
 
 
-def test_steps_of_a_zoom_in_leave_what_a_display_cannot_show():
+@pytest.mark.parametrize("scale", [2, 1 / 2, 1 / 4])
+def test_steps_leave_what_a_display_cannot_show(scale):
     """Colors up to twenty times white: steps that make all of it white do nothing for the rest."""
     splats = tiny.gaussians(60)
     splats.sh.mul_(30)
-    base = wrap_model(VanillaModel.from_gaussians(splats), cameras=tiny.cameras(2, width=16, height=12), backend="reference")
-    psnrs = base.adapt(2, steps=20, views="given", check_every=20).report.validation
+    base = wrap_model(VanillaModel.from_gaussians(splats), cameras=tiny.cameras(2, width=32, height=24), backend="reference")
+    psnrs = base.adapt(scale, steps=20, views="given", merge_to=1.0, check_every=20).report.validation
     assert psnrs["the last state"] > psnrs["the start, the closed form"] + 0.5
