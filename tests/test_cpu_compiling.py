@@ -105,13 +105,11 @@ def test_the_sources_are_all_that_kernels_are_made_of():
     assert {name for name in used if Path(*name.split(".")).with_suffix(".py") not in read} == for_python
 
 
-def test_a_kernel_from_the_cache_loads_no_compiler(cached, tmp_path):
-    cached()
-    assert "numba.np.arraymath" in sys.modules
-    code = "import sys; from mipmap_plugin.backends.cpu_kernels import binning; binning.tile_grid(65, 16); "
-    code += "print(sum(binning.tile_grid.stats.cache_hits.values()), 'numba.np.arraymath' in sys.modules)"
+def test_a_kernel_from_the_cache_loads_no_compiler(tmp_path):
+    code = "import sys; from mipmap_plugin.backends.cpu_kernels import binning; binning.tile_grid(65, 16); print('numba.np.arraymath' in sys.modules)"
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True).stdout.split() == ["1", "False"]
+    runs = [subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True).stdout for _ in range(2)]
+    assert [run.strip() for run in runs] == ["True", "False"]
 
 
 def test_with_a_later_numba_kernels_compile_as_it_likes(monkeypatch):
