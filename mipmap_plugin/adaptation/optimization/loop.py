@@ -40,8 +40,9 @@ CHECKS, STEPS_BETWEEN = 6, 5
 TRUTHS_AT_ONCE = 4
 
 # A display shows white, 1, at most: what is brighter, as a sky may be by far, would outweigh all else. At zoom-out so much of it counts, as otherwise
-# steps leave colors too bright for views that they did not see: lego and chair lose 1.7 and 2.6 dB at x1/4. At zoom-in nothing does.
-BRIGHTEST = 1.02
+# steps leave colors too bright for views that they did not see: lego and chair lose 1.7 and 2.6 dB at x1/4. At zoom-in nothing does. Beside an edge
+# a truth is brighter than white too, for a bicubic filter overshoots: there so much beyond the truth counts.
+BEYOND_WHITE = 0.02
 
 # Steps that are searched for each truth that is made ahead: as long as views are new, most steps have one.
 STEPS_AHEAD = 2
@@ -192,8 +193,8 @@ def _compare_all(
     """`_compare` of several views: in one operation where their images are of one size, since a GPU waits for each."""
     if task.scale > 1 and config.compare_at == "base":
         images = [image.detach().clamp_max(1) for image in images]
-    elif config.loss == "psnr":
-        images = [image.detach().clamp_max(BRIGHTEST) for image in images]
+    elif task.scale <= 1 and config.loss == "psnr":
+        images = [image.detach().minimum(target.clamp_min(1) + BEYOND_WHITE) for image, target in zip(images, targets, strict=True)]
     if len(images) == 1 or task.detail is not None or len({image.shape for image in (*images, *targets)}) > 1:
         return [_compare(task, config, *each) for each in zip(views, images, targets, strict=True)]
     gradients, square_errors = gradient_of(torch.stack(list(images)).detach() - torch.stack(list(targets)), config.loss)
