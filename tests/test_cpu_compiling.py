@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import os
 import re
 import subprocess
@@ -13,7 +14,8 @@ import pytest
 pytest.importorskip("numba", reason="numba, the extra `cpu`, is not installed")
 
 import numba
-from numba.core.codegen import CPUCodeLibrary
+import numpy as np
+from numba.core.codegen import CPUCodegen, CPUCodeLibrary
 
 from mipmap_plugin.backends.cpu_kernels import binning, compiling
 from mipmap_plugin.backends.cpu_kernels.memory import scratch
@@ -110,6 +112,42 @@ def test_a_kernel_from_the_cache_loads_no_compiler(tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     runs = [subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True).stdout for _ in range(2)]
     assert [run.strip() for run in runs] == ["True", "False"]
+
+
+@pytest.fixture
+def searches(monkeypatch):
+    """The kinds of numbers of each multiplication that numba looked for."""
+    searched, search = [], compiling._search
+    monkeypatch.setattr(compiling, "_found", {})
+    monkeypatch.setattr(compiling, "_search", lambda function, *rest: (searched.append((function.typing_key, *rest[1])), search(function, *rest))[1])
+    return lambda: [str(kinds[0]) for function, *kinds in searched if function is operator.mul]
+
+
+def test_an_operator_of_the_same_types_is_looked_for_once(searches):
+    kernel = compiling.kernel(lambda x, y: x * x * x * (y * y * y))
+    assert kernel(2.0, 3) == 8 * 27
+    assert sorted(searches()) == ["float64", "float64", "int64"]
+
+
+def test_what_has_no_meaning_is_refused_each_time():
+    kernel = compiling.kernel(lambda x: x * (x, x))
+    for _ in range(2):
+        with pytest.raises(numba.TypingError, match="No implementation of function"):
+            kernel(2.0)
+
+
+def test_functions_of_others_are_compiled_as_numba_does(searches):
+    compiling.kernel(lambda x: x * x)(2.0)
+    assert numba.njit(lambda x: x * x)(np.float32(2)) == 4
+    assert searches() == ["float64"]
+
+
+def test_a_kernel_is_optimized_once(monkeypatch):
+    made, manager = [], CPUCodegen._module_pass_manager
+    monkeypatch.setattr(CPUCodegen, "_module_pass_manager", lambda codegen, **options: (made.append("module"), manager(codegen, **options))[1])
+    monkeypatch.setattr(CPUCodegen, "_function_pass_manager", lambda codegen: made.append("function"))
+    assert compiling.kernel(lambda x: x + 1)(2.0) == 3
+    assert made == ["module"]
 
 
 def test_with_a_later_numba_kernels_compile_as_it_likes(monkeypatch):
