@@ -35,8 +35,8 @@ class Report(BaseModel):
         viewer: What the file is made for; None: what renders as the base's training did.
         filters: Of the pseudo truth, the base and the adapted file.
         effects: What adapting and rendering simulate, what they do not, and why.
-        gaussians_before: Splats of the base.
-        gaussians_after: Splats of the file.
+        gaussians_before: Splats of the base; where a camera decides, those of one view at the new scale.
+        gaussians_after: Splats of the file, likewise.
         seconds: By phase; "total": all of them but "loading".
         ended_by: What ended the run, such as a number of steps or a time budget.
         returned: Which of the run's states the file holds, and why if it is not the last.

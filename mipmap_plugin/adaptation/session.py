@@ -153,9 +153,8 @@ class Session:
 
     def _select(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str) -> Adapted:
         """Return the best of the states on views that did not steer the run, or the last where the settings say so."""
-        began = now(self.device)
         allowed = [name for name, model in states.items() if len(model.parameters()["means"]) <= self._most_splats]
-        (base, start, *_), last = states, allowed[-1]
+        began, (base, start, *_), last = now(self.device), states, allowed[-1]
         with self.phase("validation"):
             best, psnrs = self.validation.choose(states, allowed)
         self.seconds["total"] += now(self.device) - began
@@ -164,7 +163,8 @@ class Session:
         elif self.detail is not None and psnrs[last] >= max(psnrs[name] for name in allowed if name in (base, start)) - HARM_DB:
             best = last  # a network adds detail that the base's own image does not have, so that its gain cannot be measured
         note = "" if best == last else f": {psnrs[best]:.2f} dB on validation views, {last} {psnrs[last]:.2f} dB"
-        at_end = CurvePoint(step=0, seconds=self.seconds["total"], validation_db=psnrs[last], gaussians=count_of(states[last], self.views[0]))
+        seconds, count = self.seconds["total"], count_of(states[last], self.views[0], self.scale)
+        at_end = CurvePoint(step=0, seconds=seconds, validation_db=psnrs[last], gaussians=count)
         if not self.validation.choosing:
             note, psnrs = f", not validated: at this scale one pixel of the base is more than {WINDOW} px wide", {}
         report = self._report(states[best], curve or [at_end], ended_by, f"{best}{note}", psnrs)
@@ -283,8 +283,8 @@ class Session:
             viewer=self.request.viewer,
             filters=filters(self.scale, self.config, self.base_effects, list(self.targets.values())),
             effects=simulated(self.base, self.views[0], self.targets.values(), self.config, self.scale),
-            gaussians_before=len(self.base.gaussians(self.views[0])),
-            gaussians_after=len(student.gaussians(self.views[0])),
+            gaussians_before=count_of(self.base, self.views[0], self.scale),
+            gaussians_after=count_of(student, self.views[0], self.scale),
             seconds=self.seconds,
             ended_by=ended_by,
             returned=returned,

@@ -119,7 +119,7 @@ def training_free_rows(
 
     `viewer`: adds a row of the base as this viewer renders it.
     """
-    count = len(model.model.gaussians(model.any_camera()))
+    count = len(model.model.gaussians(model.any_camera().zoomed(scale)))
     found = baselines(model, scale, judge.protocol.shrink_by, filters=filters, upsampler=upsampler)
     in_viewers = [base_in_viewer(name, model, scale) for name in viewers_for(viewer)] if viewer else []
 

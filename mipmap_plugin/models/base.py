@@ -250,9 +250,9 @@ def _no_shapes(gaussians: Gaussians) -> str:
 
 
 @torch.no_grad()
-def count_of(model: SplatModel, view: Camera) -> int:
-    """The number of splats that a camera sees. They are made for it only where the rows of the parameters are something else."""
-    return len(model.parameters()["means"]) if model.traits.rows == SPLATS else len(model.gaussians(view))
+def count_of(model: SplatModel, view: Camera, scale: float = 1.0) -> int:
+    """The number of splats that a camera sees at `scale`. They are made for it only where the rows of the parameters are something else."""
+    return len(model.parameters()["means"]) if model.traits.rows == SPLATS else len(model.gaussians(view.zoomed(scale)))
 
 
 def tensors_of(model: SplatModel) -> dict[str, Tensor]:

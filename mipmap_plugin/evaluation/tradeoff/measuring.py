@@ -73,7 +73,7 @@ class _Measurement:
         """Yield each point: of all baselines, of all runs, and of the first run's model in other renderers."""
         plan, scale = self._plan, self._scale
         free = [each for backend in plan.backends for each in _baselines(on_backend(self._model, backend), self._truth, scale, plan)]
-        count = len(self._model.model.gaussians(self._model.any_camera()))
+        count = len(self._model.model.gaussians(self._model.any_camera().zoomed(scale)))
         total = len(free) + len(self._runs) * plan.repeats + len(RENDERERS) * plan.renderers
         with tqdm(total=total, disable=None, desc=f"tradeoff x{scale:g}") as bar, ticking(bar):
             for baseline in free:
@@ -212,7 +212,7 @@ def _renderers(model: Wrapped, adapted: Adapted | None, scale: float) -> Iterato
     effects = adapted.effects if adapted else model.effects(scale)
     title = adapted.report.settings.recipe if adapted else BASE
     seconds = Spread.of([adapted.report.seconds["total"]]) if adapted else NOTHING
-    count = len(splats.gaussians(model.any_camera()))
+    count = len(splats.gaussians(model.any_camera().zoomed(scale)))
     for name, changes, dtype in RENDERERS:
         settings = replace(effects.settings, **changes)
         point = Point(scale, "renderer", f"{title}, {name}", backend.name, count, adapt_seconds=seconds)
