@@ -100,6 +100,18 @@ def test_the_report_counts_the_splats_of_the_new_scales_levels(tmp_path):
     assert report.curve[-1].gaussians == shown
 
 
+def test_it_is_told_how_the_original_chooses_the_levels_of_the_new_scale(tmp_path):
+    wrapped = wrap_model(load(tmp_path, LAYOUTS["plain"]), cameras=VIEWS)
+    with pytest.warns(UserWarning, match=r"levels of detail for x0\.25 only with resolution_scales=\[4\] in its cfg_args"):
+        adapted = wrapped.adapt(1 / 4, views="given", steps=1)
+    assert "resolution_scales=[4]" in adapted.report.notes[-1]
+
+
+def test_nothing_is_told_of_levels_where_there_is_one(tmp_path):
+    model = load(tmp_path, LAYOUTS["plain"], level=np.zeros(40))
+    assert model.traits.shrink_option == ""
+
+
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_a_round_trip_repeats_the_rows_and_the_networks_byte_for_byte(tmp_path, name):
     model = load(tmp_path, LAYOUTS[name])

@@ -25,7 +25,7 @@ from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Quality, Validation, split_validation
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, color_limits, unrounded, views_renderer
-from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, simulated, versions
+from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, option_note, simulated, versions
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer, ends_run
 from mipmap_plugin.adaptation.shown import refuse_blind, remarks, showing, too_unlike
 from mipmap_plugin.adaptation.start.candidates import UNMATCHED, StartSearch
@@ -114,7 +114,7 @@ class Session:
             copy, reason = self._for_target(self.base), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
         found = [too_unlike(self.base_views), too_far_out(self.base, self.base_views, self.targets), unused_network(self.config, wanted)]
-        for remark in filter(None, [*remarks(self.base_views, self.base, near, orbit=self._orbits), *found]):
+        for remark in filter(None, [*remarks(self.base_views, self.base, near, orbit=self._orbits), *found, option_note(self.base, wanted)]):
             warn(remark)
         began = now(self.device) - self.seconds["total"]
         self._compile()
@@ -296,5 +296,5 @@ class Session:
             versions=versions(),
             inputs=dict(self.request.inputs),
             orbit=self.viewpoints.orbit,
-            notes=[*doubts_in(self.base.notes), *notes, *changes(self.base, student)],
+            notes=[*doubts_in(self.base.notes), *notes, *changes(self.base, student, self.scale)],
         )

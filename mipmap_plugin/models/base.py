@@ -82,6 +82,7 @@ class Traits:
         effects: Those of `effects.MODEL_EFFECTS` that the model simulates.
         rows: What a row of its parameters is, in the plural.
         thins: Some rows can be left out, for others to learn to show what they did: the model has `thin`.
+        shrink_option: The option of cfg_args that tells its own project how much smaller pictures are than in training; empty if none does.
     """
 
     same_for_all_views: bool = False
@@ -94,6 +95,7 @@ class Traits:
     effects: tuple[Effect, ...] = ()
     rows: str = SPLATS
     thins: bool = False
+    shrink_option: str = ""
 
 
 # The parameters of 3DGS.
