@@ -163,7 +163,7 @@ def test_some_projects_train_on_photographs_as_they_are(tmp_path, option, model,
 
 @pytest.mark.parametrize(
     ("cfg", "numbers"),
-    [({"eval": True}, [None, *range(7), None, 7]), ({"eval": False}, list(range(10))), ({"eval": True, "lod": 3}, [None] * 10),
+    [({"eval": True}, [None, *range(7), None, 7]), ({"eval": False}, list(range(10))), ({"eval": True, "lod": 3}, [*[None] * 4, *range(6)]),
      ({"eval": True, "appearance_dim": 0}, [None] * 10)],
 )  # fmt: skip
 def test_training_views_are_numbered_for_models_with_appearances(tmp_path, cfg, numbers):
@@ -175,7 +175,17 @@ def test_training_views_are_numbered_for_models_with_appearances(tmp_path, cfg, 
         (tmp_path / f"blender/transforms_{split}.json").parent.mkdir(exist_ok=True)
         (tmp_path / f"blender/transforms_{split}.json").write_text(json.dumps({"w": 8, "h": 8, "fl_x": 9, "frames": frames}))
     blender = load_scene(tmp_path / "blender", {"appearance_dim": 32, **cfg})
-    assert [camera.index for camera in blender.cameras] == ([*numbers[1:3], None, None] if cfg["eval"] else [0, 1, 2, 3])
+    trained = [None, None] if cfg.get("appearance_dim") == 0 else [0, 1]
+    assert [camera.index for camera in blender.cameras] == ([*trained, None, None] if cfg["eval"] else [0, 1, 2, 3])
+
+
+@pytest.mark.parametrize(("lod", "tests"), [(3, [0, 1, 2, 3]), (54, [55, 56, 57, 58, 59])])
+def test_the_option_lod_of_scaffold_holds_out_the_first_or_the_last_views(tmp_path, lod, tests):
+    """scene/dataset_readers.py: up to 49 those with numbers up to it, from 50 on those with larger ones."""
+    write_text_model(tmp_path / "sparse/0", [f"{number:03}.png" for number in range(60)])
+    scene = load_scene(tmp_path, {"eval": True, "lod": lod})
+    assert [number for number, camera in enumerate(scene.cameras) if camera.split == "test"] == tests
+    assert f"what lod={lod} holds out is for testing" in scene.notes[0]
 
 
 def test_notes_say_what_was_assumed(tmp_path):

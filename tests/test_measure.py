@@ -7,6 +7,7 @@ import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import anchor_checkpoints
 import pytest
 import tiny
 import torch
@@ -65,6 +66,14 @@ def test_everything_that_needs_no_adapting_has_its_name(scale, names):
 def test_the_filter_of_training_is_the_base_and_no_row_of_its_own():
     model = wrapped(trained=TrainedScale("antialiased", 0.3))
     assert [baseline.name for baseline in baselines(model, 2, "area")] == ["base", "scaled", "window", "base, resized"]
+
+
+def test_a_baseline_counts_the_splats_that_levels_of_detail_show_where_it_draws_the_base(tmp_path):
+    view = tiny.cameras(1)[0]
+    model = wrap_model(anchor_checkpoints.write(tmp_path / "model", anchor_checkpoints.Layout("octree"), count=80), cameras=[view])
+    counts = {baseline.name: baseline.gaussians for baseline in baselines(model, 1 / 4, "area")}
+    near, far = (len(model.model.gaussians(view.zoomed(zoom))) for zoom in (1, 1 / 4))
+    assert (counts["base, resized"], counts["base"]) == (near, far) and far < near
 
 
 def test_an_upsampler_stands_beside_the_bicubic_one_at_zoom_in_only():

@@ -13,6 +13,7 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.torchscript import read_torchscript
 from mipmap_plugin.models import load_model
+from mipmap_plugin.wrap import wrap_model
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
@@ -88,6 +89,27 @@ def test_adapting_gains_and_leaves_the_base_and_what_is_frozen(tmp_path, scale, 
     assert is_same(before, state_of(model))
     moved = {"features", "scales", *model.shared_parameters(), *(["offsets"] if scale < 1 else [])}
     assert {name for name in before if not torch.equal(before[name], after[name])} == moved
+
+
+def test_the_report_counts_the_splats_of_the_new_scales_levels(tmp_path):
+    model = load(tmp_path, LAYOUTS["plain"], count=80)
+    adapted = wrap_model(model, cameras=VIEWS).adapt(1 / 4, views="given", steps=1)
+    report, view = adapted.report, VIEWS[0].zoomed(1 / 4)
+    shown = len(adapted.model.gaussians(view))
+    assert (report.gaussians_before, report.gaussians_after) == (len(model.gaussians(view)), shown)
+    assert report.curve[-1].gaussians == shown
+
+
+def test_it_is_told_how_the_original_chooses_the_levels_of_the_new_scale(tmp_path):
+    wrapped = wrap_model(load(tmp_path, LAYOUTS["plain"]), cameras=VIEWS)
+    with pytest.warns(UserWarning, match=r"levels of detail for x0\.25 only with resolution_scales=\[4\] in its cfg_args"):
+        adapted = wrapped.adapt(1 / 4, views="given", steps=1)
+    assert "resolution_scales=[4]" in adapted.report.notes[-1]
+
+
+def test_nothing_is_told_of_levels_where_there_is_one(tmp_path):
+    model = load(tmp_path, LAYOUTS["plain"], level=np.zeros(40))
+    assert model.traits.shrink_option == ""
 
 
 @pytest.mark.parametrize("name", LAYOUTS)

@@ -35,8 +35,8 @@ class Report(BaseModel):
         viewer: What the file is made for; None: what renders as the base's training did.
         filters: Of the pseudo truth, the base and the adapted file.
         effects: What adapting and rendering simulate, what they do not, and why.
-        gaussians_before: Splats of the base.
-        gaussians_after: Splats of the file.
+        gaussians_before: Splats of the base; where a camera decides, those of one view at the new scale.
+        gaussians_after: Splats of the file, likewise.
         seconds: By phase; "total": all of them but "loading".
         ended_by: What ended the run, such as a number of steps or a time budget.
         returned: Which of the run's states the file holds, and why if it is not the last.
@@ -150,8 +150,8 @@ def simulated(base: SplatModel, view: Camera, targets: Iterable[Effects], config
     return [next((effect for effect in same if effect.on), same[0]) for same in zip(*per_target, strict=True)]
 
 
-def changes(base: SplatModel, adapted: SplatModel) -> list[str]:
-    """What became of rows that are no splats, and of what all rows share, in sentences without a full stop."""
+def changes(base: SplatModel, adapted: SplatModel, scale: float) -> list[str]:
+    """What became of rows that are no splats, of what all rows share, and how to show it, in sentences without a full stop."""
     found, before = [], base.shared_parameters()
     if (rows := base.traits.rows) != SPLATS:
         left, all_of_them = (len(model.parameters()["means"]) for model in (adapted, base))
@@ -159,7 +159,16 @@ def changes(base: SplatModel, adapted: SplatModel) -> list[str]:
     moved = {name.partition(".")[0] for name, tensor in adapted.shared_parameters().items() if not torch.equal(tensor, before[name])}
     if moved:
         found.append(f"what the {rows} share has changed too: {', '.join(sorted(moved))}")
-    return found
+    return [*found, *filter(None, [option_note(base, scale)])]
+
+
+def option_note(base: SplatModel, scale: float) -> str:
+    """How to tell the base's own project that its levels of detail are to be those of the new scale, in a sentence; "" if it need not be told."""
+    option = base.traits.shrink_option
+    if scale == 1 or not option:
+        return ""
+    told = f"{option}=[{1 / scale:g}] in its cfg_args, in place of an option for the size of pictures"
+    return f"its own project chooses levels of detail for x{scale:g} only with {told}; otherwise it shows this file with those of the training"
 
 
 def versions() -> dict[str, str]:

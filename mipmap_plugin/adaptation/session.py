@@ -25,7 +25,7 @@ from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Quality, Validation, split_validation
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, color_limits, unrounded, views_renderer
-from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, simulated, versions
+from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, option_note, simulated, versions
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer, ends_run
 from mipmap_plugin.adaptation.shown import refuse_blind, remarks, showing, too_unlike
 from mipmap_plugin.adaptation.start.candidates import UNMATCHED, StartSearch
@@ -114,7 +114,7 @@ class Session:
             copy, reason = self._for_target(self.base), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
         found = [too_unlike(self.base_views), too_far_out(self.base, self.base_views, self.targets), unused_network(self.config, wanted)]
-        for remark in filter(None, [*remarks(self.base_views, self.base, near, orbit=self._orbits), *found]):
+        for remark in filter(None, [*remarks(self.base_views, self.base, near, orbit=self._orbits), *found, option_note(self.base, wanted)]):
             warn(remark)
         began = now(self.device) - self.seconds["total"]
         self._compile()
@@ -153,9 +153,8 @@ class Session:
 
     def _select(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str) -> Adapted:
         """Return the best of the states on views that did not steer the run, or the last where the settings say so."""
-        began = now(self.device)
         allowed = [name for name, model in states.items() if len(model.parameters()["means"]) <= self._most_splats]
-        (base, start, *_), last = states, allowed[-1]
+        began, (base, start, *_), last = now(self.device), states, allowed[-1]
         with self.phase("validation"):
             best, psnrs = self.validation.choose(states, allowed)
         self.seconds["total"] += now(self.device) - began
@@ -164,7 +163,8 @@ class Session:
         elif self.detail is not None and psnrs[last] >= max(psnrs[name] for name in allowed if name in (base, start)) - HARM_DB:
             best = last  # a network adds detail that the base's own image does not have, so that its gain cannot be measured
         note = "" if best == last else f": {psnrs[best]:.2f} dB on validation views, {last} {psnrs[last]:.2f} dB"
-        at_end = CurvePoint(step=0, seconds=self.seconds["total"], validation_db=psnrs[last], gaussians=count_of(states[last], self.views[0]))
+        seconds, count = self.seconds["total"], count_of(states[last], self.views[0], self.scale)
+        at_end = CurvePoint(step=0, seconds=seconds, validation_db=psnrs[last], gaussians=count)
         if not self.validation.choosing:
             note, psnrs = f", not validated: at this scale one pixel of the base is more than {WINDOW} px wide", {}
         report = self._report(states[best], curve or [at_end], ended_by, f"{best}{note}", psnrs)
@@ -283,8 +283,8 @@ class Session:
             viewer=self.request.viewer,
             filters=filters(self.scale, self.config, self.base_effects, list(self.targets.values())),
             effects=simulated(self.base, self.views[0], self.targets.values(), self.config, self.scale),
-            gaussians_before=len(self.base.gaussians(self.views[0])),
-            gaussians_after=len(student.gaussians(self.views[0])),
+            gaussians_before=count_of(self.base, self.views[0], self.scale),
+            gaussians_after=count_of(student, self.views[0], self.scale),
             seconds=self.seconds,
             ended_by=ended_by,
             returned=returned,
@@ -296,5 +296,5 @@ class Session:
             versions=versions(),
             inputs=dict(self.request.inputs),
             orbit=self.viewpoints.orbit,
-            notes=[*doubts_in(self.base.notes), *notes, *changes(self.base, student)],
+            notes=[*doubts_in(self.base.notes), *notes, *changes(self.base, student, self.scale)],
         )

@@ -119,12 +119,12 @@ def training_free_rows(
 
     `viewer`: adds a row of the base as this viewer renders it.
     """
-    count = len(model.model.gaussians(model.any_camera()))
     found = baselines(model, scale, judge.protocol.shrink_by, filters=filters, upsampler=upsampler)
     in_viewers = [base_in_viewer(name, model, scale) for name in viewers_for(viewer)] if viewer else []
 
     def row(baseline: Baseline) -> Row:
-        return judge.cell({"row": baseline.name, "scale": scale}, lambda judge: judge.row(baseline.name, scale, baseline.render, gaussians=count))
+        name, render, count = baseline.name, baseline.render, baseline.gaussians
+        return judge.cell({"row": name, "scale": scale}, lambda judge: judge.row(name, scale, render, gaussians=count))
 
     return [row(baseline) for baseline in found] + worst([row(baseline) for baseline in in_viewers])
 

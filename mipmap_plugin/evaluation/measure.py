@@ -19,6 +19,7 @@ from mipmap_plugin.adaptation.target.upsamplers import find_upsampler
 from mipmap_plugin.adaptation.views import extent
 from mipmap_plugin.adaptation.warn import silent
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.models.base import count_of
 from mipmap_plugin.wrap import Wrapped
 
 RenderView = Callable[[Camera], Tensor]  # a camera of the base scale -> [h, w, 3]
@@ -48,6 +49,7 @@ class Baseline:
     name: str
     kind: Kind
     backend: str  # the backend that renders it
+    gaussians: int  # the number of splats that one view shows
     render: RenderView
 
 
@@ -75,11 +77,11 @@ def baselines(
 
     def rendered(name: str, kind: Kind, screen_filter: str | None, n: int = 1) -> Baseline:
         backend = model.backend(screen_filter=screen_filter)[0].name
-        return Baseline(name, kind, backend, lambda view: _render(model, view.zoomed(scale), scale, screen_filter, n))
+        return Baseline(name, kind, backend, splats_shown(model, scale), lambda view: _render(model, view.zoomed(scale), scale, screen_filter, n))
 
     def resized(name: str, by: str) -> Baseline:
         render = lambda view: resized_base(model.render(view).image, view.zoomed(scale).size, shrink_by=shrink_by, upsampler=by)  # noqa: E731
-        return Baseline(name, "supersampling" if scale < 1 else "filter", model.backend()[0].name, render)
+        return Baseline(name, "supersampling" if scale < 1 else "filter", model.backend()[0].name, splats_shown(model), render)
 
     found = [rendered(BASE, "base", None)]
     if scale == 1:
@@ -101,7 +103,13 @@ def baselines(
 def base_in_viewer(viewer: str, model: Wrapped, scale: float) -> Baseline:
     """The base as a viewer renders it. Raises SettingsError for an unknown viewer, and BackendUnavailable."""
     backend = model.backend(viewer=viewer)[0].name
-    return Baseline(f"{BASE} in {viewer}", "base", backend, lambda view: model.render(view.zoomed(scale), viewer=viewer).image)
+    render = lambda view: model.render(view.zoomed(scale), viewer=viewer).image  # noqa: E731
+    return Baseline(f"{BASE} in {viewer}", "base", backend, splats_shown(model, scale), render)
+
+
+def splats_shown(model: Wrapped, scale: float = 1.0) -> int:
+    """The number of the base's splats that one view shows at `scale`."""
+    return count_of(model.model, model.any_camera(), scale)
 
 
 def _render(model: Wrapped, camera: Camera, scale: float, screen_filter: str | None, n: int) -> Tensor:

@@ -82,6 +82,7 @@ class Traits:
         effects: Those of `effects.MODEL_EFFECTS` that the model simulates.
         rows: What a row of its parameters is, in the plural.
         thins: Some rows can be left out, for others to learn to show what they did: the model has `thin`.
+        shrink_option: The option of cfg_args that tells its own project how much smaller pictures are than in training; empty if none does.
     """
 
     same_for_all_views: bool = False
@@ -94,6 +95,7 @@ class Traits:
     effects: tuple[Effect, ...] = ()
     rows: str = SPLATS
     thins: bool = False
+    shrink_option: str = ""
 
 
 # The parameters of 3DGS.
@@ -250,9 +252,9 @@ def _no_shapes(gaussians: Gaussians) -> str:
 
 
 @torch.no_grad()
-def count_of(model: SplatModel, view: Camera) -> int:
-    """The number of splats that a camera sees. They are made for it only where the rows of the parameters are something else."""
-    return len(model.parameters()["means"]) if model.traits.rows == SPLATS else len(model.gaussians(view))
+def count_of(model: SplatModel, view: Camera, scale: float = 1.0) -> int:
+    """The number of splats that a camera sees at `scale`. They are made for it only where the rows of the parameters are something else."""
+    return len(model.parameters()["means"]) if model.traits.rows == SPLATS else len(model.gaussians(view.zoomed(scale)))
 
 
 def tensors_of(model: SplatModel) -> dict[str, Tensor]:

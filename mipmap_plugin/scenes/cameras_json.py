@@ -20,6 +20,9 @@ from mipmap_plugin.limits import path_of
 # INRIA's reader holds out every eighth photograph of a COLMAP scene.
 TEST_EVERY = 8
 
+# Scaffold-GS's option `lod` (scene/dataset_readers.py): up to this number it holds out the first views by name, from it on those behind.
+LOD_OF_FIRST = 50
+
 # An option in the cfg_args of Deformable 3D Gaussians that no other project has which reads captures of HyperNeRF.
 DEFORMABLE = "is_6dof"
 
@@ -80,6 +83,9 @@ def _tests(names: list[str], path: Path, cfg: dict[str, Any]) -> set[int]:
     text, numbers too (0, 1, 10, 2), and so does this: in another order other views would be held out than in the training. Warns of another order of
     unique names, in which the test cameras may be others.
     """
+    if (held_out := tests_by_lod(len(names), cfg)) is not None and len(set(names)) == len(names):
+        chosen = {name for place, name in enumerate(sorted(names)) if place in held_out}
+        return {place for place, name in enumerate(names) if name in chosen}
     first = count_test_cameras(names)
     leading, by_name = set(range(first)), sorted(names)
     numberless = [re.sub(r"\d+", "", name) for name in names]
@@ -94,6 +100,15 @@ def _tests(names: list[str], path: Path, cfg: dict[str, Any]) -> set[int]:
         order = "its cameras are neither in the order that 3DGS writes nor sorted by name"
         warnings.warn(f"{path}: {order}, so the first {first} of {len(names)} are taken as the test views, which may be others", stacklevel=3)
     return leading
+
+
+def tests_by_lod(count: int, cfg: dict[str, Any]) -> set[int] | None:
+    """The places by name of the views that Scaffold-GS's `lod` holds out of `count`; None without it, and where that leaves none to train on."""
+    lod = cfg.get("lod")
+    if not cfg.get("eval") or not isinstance(lod, int) or lod <= 0:
+        return None
+    tests = set(range(min(lod + 1, count)) if lod < LOD_OF_FIRST else range(lod + 1, count))
+    return tests if len(tests) < count else None
 
 
 def count_test_cameras(names: list[str]) -> int:
@@ -116,9 +131,9 @@ def count_test_cameras(names: list[str]) -> int:
 def numbers_views(cfg: dict[str, Any], split: str) -> bool:
     """Whether a view of a scene has a number in the training (`Camera.index`): only a model with appearances asks for it.
 
-    Without `eval` all views were trained on. With the option `lod` of Scaffold-GS the split is another, and numbers are not known.
+    Without `eval` all views were trained on.
     """
-    return bool(cfg.get("appearance_dim")) and not cfg.get("lod") and (split == "train" or not cfg.get("eval"))
+    return bool(cfg.get("appearance_dim")) and (split == "train" or not cfg.get("eval"))
 
 
 def photographs_folder(cfg: dict[str, Any]) -> str:

@@ -17,7 +17,7 @@ from mipmap_plugin.errors import SceneError, brief
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import pixels
 from mipmap_plugin.scenes.base import ABSENT, SPLIT, Scene, refuse_other_shape
-from mipmap_plugin.scenes.cameras_json import TEST_EVERY, numbers_views, photographs_folder, trained_size
+from mipmap_plugin.scenes.cameras_json import TEST_EVERY, numbers_views, photographs_folder, tests_by_lod, trained_size
 from mipmap_plugin.scenes.colmap_sizes import refuse_truncated
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, note
 
@@ -63,8 +63,10 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     photographs: dict[Camera, Path] = {}
     lenses: dict[Path, Lens] = {}
     trained, unbent = count(), unbent_by(cfg)
+    by_lod = tests_by_lod(len(images), cfg)
+    tests = range(0, len(images), TEST_EVERY) if by_lod is None else by_lod
     for index, image in enumerate(images):
-        camera = _camera(model, image, "train" if index % TEST_EVERY else "test", centered=bool(cfg))
+        camera = _camera(model, image, "test" if index in tests else "train", centered=bool(cfg))
         photograph, lens = folder / image.name, _lens(model.cameras[image.camera_id], unbent)
         exists, options = is_file(photograph), cfg
         if exists:
@@ -82,7 +84,7 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         cameras.append(camera)
         if exists:
             photographs[camera] = photograph
-    notes = _notes(cameras, photographs, folder) + ([note(lenses.values())] if lenses else [])
+    notes = _notes(cameras, photographs, folder, None if by_lod is None else cfg["lod"]) + ([note(lenses.values())] if lenses else [])
     if is_copy:
         notes.append(f"there is no folder {photographs_folder(cfg)}: the photographs are those of {folder.name}")
     if models := sorted({lens.model for camera in model.cameras.values() if (lens := _lens(camera)) and lens.model in unbent}):
@@ -177,8 +179,9 @@ def _points(model: pycolmap.Reconstruction) -> Tensor | None:
     return torch.tensor(places, dtype=torch.float64) if places else None
 
 
-def _notes(cameras: list[Camera], photographs: dict[Camera, Path], folder: Path) -> list[str]:
-    notes = [f"{len(cameras)} cameras in the order of their names: every {TEST_EVERY}th {SPLIT}, the others for training"]
+def _notes(cameras: list[Camera], photographs: dict[Camera, Path], folder: Path, lod: int | None) -> list[str]:
+    tests = f"what lod={lod} holds out" if lod else f"every {TEST_EVERY}th"
+    notes = [f"{len(cameras)} cameras in the order of their names: {tests} {SPLIT}, the others for training"]
     if absent := len(cameras) - len(photographs):
         notes.append(f"{absent} of {len(cameras)} photographs of the COLMAP model are {ABSENT} from {folder}; their cameras are views without one")
     return notes

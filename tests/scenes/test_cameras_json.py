@@ -64,6 +64,16 @@ def test_an_absent_file_is_named(tmp_path):
         read_cameras(tmp_path / "cameras.json")
 
 
+@pytest.mark.parametrize(("lod", "tests"), [(3, [0, 1, 2, 3]), (54, [55, 56, 57, 58, 59])])
+def test_the_option_lod_of_scaffold_holds_out_the_first_or_the_last_views_by_name(tmp_path, lod, tests):
+    """Each view behind them has the number that its appearance has in the model."""
+    trained = [number for number in range(60) if number not in tests]
+    path = write_json(tmp_path / "cameras.json", [entry(img_name=f"{number:03}") for number in (*tests, *trained)])
+    cameras = read_cameras(path, {"eval": True, "lod": lod})
+    assert [int(camera.name) for camera in cameras if camera.split == "test"] == tests
+    assert [(camera.index, int(camera.name)) for camera in cameras if camera.split == "train"] == list(enumerate(trained))
+
+
 @pytest.mark.parametrize(
     ("names", "count"),
     [(["r_0", "r_1", "r_0", "r_1", "r_2"], 2), ([str(i) for i in range(16)], 2), ([str(i) for i in range(17)], 3), (["a"], 1)],

@@ -26,7 +26,6 @@ from mipmap_plugin.adaptation.target.resize import difference_from, gradient_bef
 from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.models.base import count_of
 from mipmap_plugin.process.threads import side_by_side
 from mipmap_plugin.progress import ticking
 
@@ -84,7 +83,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
                 _check(run, task, config)
             elif undone:  # the check of this step was of the growth
                 psnr = run.costs.check(lambda: task.validation.quality(run.student)).psnr
-                run.curve[-1] = run.curve[-1].model_copy(update={"validation_db": psnr, "gaussians": count_of(run.student, task.views[0])})
+                run.curve[-1] = run.curve[-1].model_copy(update={"validation_db": psnr, "gaussians": task.count(run.student)})
         if interrupted():
             on_interrupt(run)
     return reason or End.STEPS
@@ -251,7 +250,7 @@ def _check(run: Run, task: Task, config: AdaptConfig) -> None:
     best_db = next((point.validation_db for point in reversed(run.curve) if point.step == steering.best_step), quality.psnr)
     point = CurvePoint(
         step=run.step, seconds=run.watch.read(), psnr_db=decibel(mean) if steps else None,
-        validation_db=best_db if harmful else quality.psnr, gaussians=count_of(run.student, task.views[0]), taken_back=harmful,
+        validation_db=best_db if harmful else quality.psnr, gaussians=task.count(run.student), taken_back=harmful,
     )  # fmt: skip
     run.curve.append(point)
     run.square_error = 0.0

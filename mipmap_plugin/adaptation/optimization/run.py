@@ -65,6 +65,10 @@ class Task:
             return self.render_views(gaussians, cameras, draw)
         return [self.renderer(draw + number)(gaussians, camera) for number, camera in enumerate(cameras)]
 
+    def count(self, model: SplatModel) -> int:
+        """The number of splats that the first view shows at the new scale."""
+        return count_of(model, self.views[0], self.scale)
+
     def pixel(self, means: Tensor) -> float:
         """The size of a target pixel at the median of `means` [N, 3], in world units."""
         return float(pixel_size(means.detach(), self.views).median()) / self.scale
@@ -127,7 +131,7 @@ class Run:
             trial, costs = Trial.begin(student, task, config), Costs(motion=lambda: task.follow.seconds, device=means.device)
             quality = costs.check(lambda: task.validation.quality(student))
             steering = Steering.begin(student, quality.visible)
-        first = CurvePoint(step=0, seconds=watch.read(), psnr_db=None, validation_db=quality.psnr, gaussians=count_of(student, task.views[0]))
+        first = CurvePoint(step=0, seconds=watch.read(), psnr_db=None, validation_db=quality.psnr, gaussians=task.count(student))
         return cls(student, optimizer, watch, ScreenGradients.of(means, config), steering, trial, curve=[first], costs=costs)
 
     def progress(self, config: AdaptConfig) -> float:

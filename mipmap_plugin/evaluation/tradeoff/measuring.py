@@ -33,7 +33,7 @@ from mipmap_plugin.evaluation.measure import (
 )  # fmt: skip
 from mipmap_plugin.evaluation.tradeoff.points import NOTHING, Plan, Point, Spread
 from mipmap_plugin.evaluation.tradeoff.truth import GroundTruth
-from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.models.base import SplatModel, count_of
 from mipmap_plugin.progress import ticking
 from mipmap_plugin.recipes import most_steps
 from mipmap_plugin.recipes import recipe as make_config
@@ -73,11 +73,10 @@ class _Measurement:
         """Yield each point: of all baselines, of all runs, and of the first run's model in other renderers."""
         plan, scale = self._plan, self._scale
         free = [each for backend in plan.backends for each in _baselines(on_backend(self._model, backend), self._truth, scale, plan)]
-        count = len(self._model.model.gaussians(self._model.any_camera()))
         total = len(free) + len(self._runs) * plan.repeats + len(RENDERERS) * plan.renderers
         with tqdm(total=total, disable=None, desc=f"tradeoff x{scale:g}") as bar, ticking(bar):
             for baseline in free:
-                yield from self._kept({"baseline": baseline.name, "backend": baseline.backend}, partial(self._of_baseline, baseline, count))
+                yield from self._kept({"baseline": baseline.name, "backend": baseline.backend}, partial(self._of_baseline, baseline))
                 bar.update()
             for name, steps, backend in self._runs:
                 run = {"recipe": name, "steps": steps, "backend": backend, "made": self._made(name)}
@@ -101,8 +100,8 @@ class _Measurement:
         self._cells.keep(key, {"points": [asdict(point) for point in points]})
         return points
 
-    def _of_baseline(self, baseline: Baseline, count: int) -> list[Point]:
-        point = Point(self._scale, baseline.kind, baseline.name, baseline.backend, count)
+    def _of_baseline(self, baseline: Baseline) -> list[Point]:
+        point = Point(self._scale, baseline.kind, baseline.name, baseline.backend, baseline.gaussians)
         return [_measured(point, baseline.render, self._truth, self._plan.repeats)]
 
     def _of_run(self, recipe: str, steps: int | None, backend: str, bar: tqdm) -> list[Point]:
@@ -212,7 +211,7 @@ def _renderers(model: Wrapped, adapted: Adapted | None, scale: float) -> Iterato
     effects = adapted.effects if adapted else model.effects(scale)
     title = adapted.report.settings.recipe if adapted else BASE
     seconds = Spread.of([adapted.report.seconds["total"]]) if adapted else NOTHING
-    count = len(splats.gaussians(model.any_camera()))
+    count = count_of(splats, model.any_camera(), scale)
     for name, changes, dtype in RENDERERS:
         settings = replace(effects.settings, **changes)
         point = Point(scale, "renderer", f"{title}, {name}", backend.name, count, adapt_seconds=seconds)

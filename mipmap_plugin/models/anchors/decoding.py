@@ -74,5 +74,6 @@ def _appearance(table: Tensor, camera: Camera) -> Tensor:
     if camera.index is None:
         return table.mean(dim=0, keepdim=True)
     if not 0 <= camera.index < len(table):
-        raise SettingsError(f"camera {camera.name!r} has index {camera.index}, but the model has the appearance of {len(table)} views only")
+        has = f"camera {camera.name!r} has index {camera.index}, but the model has the appearance of {len(table)} views only"
+        raise SettingsError(f"{has}; give the cameras of its training, or an index of None for the mean of all")
     return table[camera.index][None]

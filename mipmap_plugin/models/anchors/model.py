@@ -45,6 +45,7 @@ class AnchorModel(ABC):
     """
 
     family: str
+    _shrink_option = ""  # `Traits.shrink_option`
 
     def __init__(self, read: AnchorFile, inputs: Mapping[str, tuple[str, ...]]) -> None:
         """`inputs`: the inputs of each network, in order (`decoding.decode`)."""
@@ -60,7 +61,7 @@ class AnchorModel(ABC):
     @property
     def traits(self) -> Traits:
         no_viewer = "networks decode its splats for each camera, which none of the viewers does"
-        return Traits(no_viewer=no_viewer, effects=self._effects(), rows="anchors", thins=True)
+        return Traits(no_viewer=no_viewer, effects=self._effects(), rows="anchors", thins=True, shrink_option=self._shrink_option)
 
     def _effects(self) -> tuple[Effect, ...]:
         products = sum(tensor.numel() for name, tensor in self.shared_parameters().items() if tensor.dim() == 2 and not name.startswith("appearance"))

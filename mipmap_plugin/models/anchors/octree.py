@@ -43,6 +43,8 @@ class OctreeModel(AnchorModel):
         self._levels = int(levels.max() - levels.min()) + 1
         if self._levels > MAX_LEVELS:
             raise CheckpointError(f"{self.source}: its anchors lie in {self._levels:,} levels of detail; the file is damaged, so export it again")
+        if self._levels > 1:
+            self._shrink_option = "resolution_scales"  # -r makes pictures smaller, and leaves the levels as they are (utils/camera_utils.py)
         self.notes.append(f"{self._levels} levels of detail, chosen by distance and zoom ({to_level}, each {fork:g} times finer)")
 
     def _effects(self) -> tuple[Effect, ...]:

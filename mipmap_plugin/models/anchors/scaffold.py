@@ -34,8 +34,8 @@ def load_scaffold(path: str | Path, *, iteration: int | None = None) -> Scaffold
     """
     read = read_anchors(path, "scaffold", iteration)
     model = _model(read, read.origin.source)
-    if read.options.get("lod"):
-        model.notes.append(f"cfg_args says lod={read.options['lod']}: the original's test views are not every eighth, so name the views you want")
+    if read.options.get("eval") and (lod := read.options.get("lod")):
+        model.notes.append(f"cfg_args says lod={lod}: its test views are the first or the last ones by name, not every eighth")
     return model
 
 
