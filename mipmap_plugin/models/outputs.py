@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -14,7 +15,7 @@ from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.formats.atomic import absolute, named, refuse_output, refuse_to_lose
 from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.formats.ply import read_header
-from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_glb, is_written, refuse_as_folder, refuse_exchange
+from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_glb, is_spz, is_written, refuse_as_folder, refuse_exchange
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.health import rows_where
@@ -28,6 +29,9 @@ WRITTEN = (
 
 # World units: a single splat farther away leaves SPZ fewer than the usual 12 bits for fractions of a unit, for the positions of all (`formats.spz`).
 SPZ_REACH = 2048.0
+
+# What SPZ stores: log scales, the size of the coefficients of degree 0 (whose color lies between -0.44 and 1.44), and that of all others.
+SPZ_LOG_SCALES, SPZ_COLOR, SPZ_HARMONICS = (-10.0, 5.9375), 0.5 / 0.15, 1.0
 
 # Finite numbers that in float32 activate as an infinite logit and logarithm do: to an opacity of 1 or 0, and a length of almost 0.
 LOGIT, LOG_SCALE = 80.0, -87.0
@@ -94,6 +98,25 @@ def without_place(path: Path, extras: Iterable[str], sh_degree: int) -> str:
     without = "glTF has no place for" if is_glb(path) else f"{TOOL} does not write"
     lost += [f"SH bands above degree {MOST_BANDS} are dropped, which {without}; a .ply has them"] if sh_degree > MOST_BANDS else []
     return "; ".join(lost)
+
+
+def cut_off(path: Path, parameters: Mapping[str, Tensor]) -> str:
+    """How many of the splats with these raw `parameters` an SPZ at `path` cannot hold, even rounded, in a sentence; "" for any other format.
+
+    Of thin splats only the longest axis counts: the others are lengthened by less than anybody sees.
+    """
+    if not is_spz(path) or not {"scales", "sh0", "shN"} <= parameters.keys():
+        return ""
+    longest, (least, most) = parameters["scales"].detach().amax(dim=1), SPZ_LOG_SCALES
+    colors, harmonics = (parameters[name].detach().abs().flatten(1) for name in ("sh0", "shN"))
+    beyond = {
+        f"longer than {math.exp(most):,.0f} units": longest > most,
+        f"shorter than {math.exp(least):.2g} units": longest < least,
+        "with a color of degree 0 outside -0.44 to 1.44": (colors > SPZ_COLOR).any(dim=1),
+        "with other harmonics outside -1 to 1": (harmonics > SPZ_HARMONICS).any(dim=1),
+    }
+    found = ", ".join(f"{int(where.sum()):,} {what}" for what, where in beyond.items() if where.any())
+    return f"SPZ cuts off, of {len(longest):,} splats, {found}; a .ply keeps them" if found else ""
 
 
 def drawn_otherwise(path: Path, trained: TrainedScale) -> str:

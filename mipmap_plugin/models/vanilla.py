@@ -27,7 +27,7 @@ from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
 from mipmap_plugin.models.health import LARGEST
 from mipmap_plugin.models.hosts import Capture, Host
 from mipmap_plugin.models.inria_folder import cfg_args_for, write_folder
-from mipmap_plugin.models.outputs import finite, refuse_format, refuse_parts, without_place
+from mipmap_plugin.models.outputs import cut_off, finite, refuse_format, refuse_parts, without_place
 from mipmap_plugin.models.raw import check, log, logit, moved, raw_parameters
 from mipmap_plugin.splatting.bands import joined, neighbors
 from mipmap_plugin.splatting.rotations import unit_quaternions
@@ -215,7 +215,7 @@ class VanillaModel:
         parameters = finite(self._parameters, LARGEST)
         comments = with_tags(self._origin.comments, self.trained.screen_filter, provenance, self.trained.eps2d)
         if is_written(path):
-            if lost := without_place(path, self._origin.extras, self.sh_degree):
+            for lost in filter(None, (without_place(path, self._origin.extras, self.sh_degree), cut_off(path, parameters))):
                 warnings.warn(lost, stacklevel=2)
             exchanged = self._columns(parameters | {"shN": parameters["shN"][:, : (MOST_BANDS + 1) ** 2 - 1]})
             if is_glb(path):

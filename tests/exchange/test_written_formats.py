@@ -103,6 +103,22 @@ def test_columns_that_a_format_has_no_place_for_are_told_of_and_in_the_report(tm
 
 
 @pytest.mark.parametrize("ending", [".spz", ".compressed.ply", ".ply"])
+def test_what_spz_cuts_off_is_told_of_and_in_the_report(tmp_path, tool, ending, capsys):
+    """Its limits were in the documentation only. A thin splat's shorter axes do not count."""
+    columns = dict(read_ply(tiny.ply(tmp_path / "a.ply")).columns)
+    columns["scale_0"][0], columns["f_dc_1"][1:3], columns["f_rest_4"][3], columns["scale_2"][4] = 6.5, -3.5, 1.5, -20
+    for axis in range(3):
+        columns[f"scale_{axis}"][5:9] = -10.5
+    write(tmp_path / "b.ply", columns)
+    made = tmp_path / f"c{ending}"
+    assert main(["adapt", str(tmp_path / "b.ply"), "--scale", "1", "--output", str(made)]) == 0
+    lost = "1 longer than 379 units, 4 shorter than 4.5e-05 units, 2 with a color of degree 0 outside -0.44 to 1.44, 1 with other harmonics"
+    told = f"SPZ cuts off, of 60 splats, {lost} outside -1 to 1; a .ply keeps them"
+    count, notes = int(ending == ".spz"), json.loads(made.with_name(made.name + ".adaptation.json").read_text())["notes"]
+    assert capsys.readouterr().err.count(told) == count and notes.count(told) == count
+
+
+@pytest.mark.parametrize("ending", [".spz", ".compressed.ply", ".ply"])
 def test_bands_that_splat_transform_does_not_write_are_left_out_and_told_of(tmp_path, tool, ending, capsys):
     base, made = tiny.ply(tmp_path / "a.ply", degree=4), tmp_path / f"b{ending}"
     assert main(["adapt", str(base), "--scale", "1", "--output", str(made)]) == 0
