@@ -76,6 +76,15 @@ def test_no_format_is_written_for_a_viewer_that_does_not_read_it(tmp_path, tool,
     base.refuse_output(tmp_path / "a.sog", overwrite=False, viewer="gdgs")
 
 
+@pytest.mark.parametrize("name", ["a.sog", "a.spz", "a.glb", "a.compressed.ply"])
+def test_no_file_by_itself_is_written_for_cesium_but_a_ply(tmp_path, name):
+    """It opens 3D Tiles only, and was said to show a SOG."""
+    with pytest.raises(SettingsError, match=r"Cesium opens splats in 3D Tiles only, which levels --tiles writes$"):
+        refuse_unread(tmp_path / name, ["cesium"])
+    with pytest.warns(UserWarning, match=r"a.ply: Cesium opens splats in 3D Tiles only, which levels --tiles writes$"):
+        refuse_unread(tmp_path / "a.ply", ["cesium"])
+
+
 @pytest.mark.parametrize("ending", [".spz", ".compressed.ply", ".ply"])
 @pytest.mark.parametrize("viewer", [None, "antialiased"])
 def test_splats_that_not_all_viewers_of_a_format_draw_as_trained_are_told_of(tmp_path, tool, ending, viewer, capsys):
