@@ -10,8 +10,6 @@ import re
 import shutil
 import subprocess
 import tempfile
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -131,9 +129,12 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
         plain = Path(folder, "plain.ply")
         if reason := _run(tool, [_completed(source, Path(folder)) if kind == "sog" else source], plain):
             raise CheckpointError(f"{path} is {name}, but {TOOL} does not read it ({reason}); export it again")
-        _settle_frame(tool, source, plain)
-        _settle_mode(_mode(source, kind), plain)
-        yield plain
+        try:
+            _settle_frame(tool, source, plain)
+            _settle_mode(_mode(source, kind), plain)
+            yield plain
+        except CheckpointError as error:
+            raise CheckpointError(str(error).replace(str(plain), f"{path}, as {TOOL} reads it")) from error
 
 
 def _completed(source: Path, folder: Path) -> Path:
@@ -143,15 +144,9 @@ def _completed(source: Path, folder: Path) -> Path:
 
 
 def _damage(path: Path) -> str:
-    """What is wrong with a file that is a zip archive, as a SOG is; "" if nothing. The tool does not look at its checksums."""
-    if not zipfile.is_zipfile(path):
-        return ""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            wrong = archive.testzip()
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError) as error:
-        return str(error)
-    return f"the checksum of {wrong} is wrong" if wrong else ""
+    from mipmap_plugin.formats.damage import damage_of  # and NumPy, as above
+
+    return damage_of(path)
 
 
 def write_exchange(path: Path, write: Callable[[Path], Any], *, overwrite: bool) -> Path:

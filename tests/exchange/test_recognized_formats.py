@@ -50,6 +50,18 @@ def test_what_the_tool_refuses_is_one_sentence(tmp_path, tool):
     assert "splat-transform does not read it (Invalid header)" in sentence(tmp_path / "a.spz")
 
 
+@pytest.mark.parametrize("answer", ["ply\nformat ascii 1.0\nelement vertex null\nend_header\n", None])
+def test_what_is_wrong_with_what_the_tool_made_of_a_file_is_said_of_the_file(tmp_path, tool, answer):
+    """And not of a temporary PLY, which nobody knows."""
+    if answer:
+        (tool / "answer.ply").write_text(answer)
+    else:
+        columns = read_ply(tool / "answer.ply").columns
+        write(tool / "answer.ply", columns | {"x": np.full_like(columns["x"], np.nan)})
+    (tmp_path / "a.spz").write_bytes(SPZ)
+    assert sentence(tmp_path / "a.spz").startswith(f"{tmp_path / 'a.spz'}, as splat-transform reads it: ")
+
+
 def test_compressed_ply_is_recognized_by_its_columns(tmp_path, tool):
     write(tmp_path / "a.ply", {"packed_position": np.zeros(1, np.int32)})
     assert len(load_model(tmp_path / "a.ply")) == 60
@@ -71,6 +83,25 @@ def test_a_sog_whose_checksums_are_wrong_is_refused(tmp_path, tool):
     (tmp_path / "a.sog").write_bytes((tmp_path / "a.sog").read_bytes().replace(b"abcd", b"abce"))
     with pytest.raises(CheckpointError, match=r"is damaged \(the checksum of means_l.webp is wrong\)"):
         load_model(tmp_path / "a.sog")
+
+
+def test_a_gzipped_spz_that_is_cut_off_is_said_to_be(tmp_path, tool):
+    """splat-transform told its time and memory, in place of a reason."""
+    (tmp_path / "a.spz").write_bytes(gzip.compress(SPZ)[:-12])
+    assert sentence(tmp_path / "a.spz") == f"{tmp_path / 'a.spz'} is damaged (it is cut off); download or export it again"
+
+
+@pytest.mark.parametrize("packed", ["spz", "sog"])
+def test_a_bomb_is_not_unpacked(tmp_path, tool, packed):
+    path, content = tmp_path / f"a.{packed}", json.dumps({"version": 2, "means": {"files": ["means_l.webp"]}})
+    if packed == "spz":
+        path.write_bytes(gzip.compress(SPZ + bytes(1 << 20)))
+    else:
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("meta.json", content)
+            archive.writestr("means_l.webp", bytes(1 << 20))
+    assert "is damaged (it would be more than 100 times as large unpacked" in sentence(path)
+    assert not (tool / "asked.json").exists()
 
 
 @pytest.mark.parametrize("where", ["a.sog", "room", "room/meta.json"])
