@@ -18,6 +18,7 @@ import numpy as np
 from mipmap_plugin.formats.codebooks import codebook, palette
 from mipmap_plugin.formats.images import lossless_webp
 from mipmap_plugin.formats.tags import DAMAGE, meta_of_sog
+from mipmap_plugin.formats.zipped import FULL
 
 # Entries of the table of spherical harmonics: their numbers have 16 bits, and 64 of them lie in a row.
 MOST_ENTRIES, IN_A_ROW = 1 << 16, 64
@@ -80,6 +81,7 @@ def completed(source: Path, folder: Path) -> Path:
     """A SOG that says how many entries its table of harmonics has: `source`, which is an archive or a meta.json, or a copy of it in `folder`.
 
     LichtFeld Studio wrote `palette_size` for `count` in 2025. Without that, splat-transform reads harmonics as 0.
+    Raises OSError where the disk is full.
     """
     try:
         meta = meta_of_sog(source)
@@ -94,7 +96,9 @@ def completed(source: Path, folder: Path) -> Path:
         copy = folder / source.name
         copy.write_text(text)
         return copy
-    except DAMAGE:
+    except DAMAGE as error:
+        if isinstance(error, OSError) and error.errno in FULL:
+            raise  # without its copy the file would be read with wrong colors
         return source  # of which splat-transform tells
 
 
