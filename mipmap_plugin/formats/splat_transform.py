@@ -263,4 +263,5 @@ def reason_in(said: str) -> str:
     """What splat-transform says went wrong: its line with the error, before a trace and a summary, or else its last one."""
     lines = [line.strip() for line in said.splitlines() if line.strip()]
     errors = [found[1] for line in lines if (found := re.search(r"Error(?: \[\w+\])?: (.*)", line))]
-    return (errors[0] if errors else lines[-1] if lines else "")[:160]
+    others = [line.removeprefix("✗ ") for line in lines if not re.match("at |✗ failed in ", line)]  # an error may have no text but its type
+    return (errors or others[-1:] or lines[-1:] or [""])[0][:160]

@@ -15,6 +15,7 @@ from ply_files import write, write_splats
 
 from mipmap_plugin.errors import CheckpointError, OutputError
 from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.formats.splat_transform import reason_in
 from mipmap_plugin.models import detect, load_model
 from mipmap_plugin.models.adapted_name import adapted_name
 
@@ -43,6 +44,12 @@ def test_a_file_is_read_under_the_ending_that_the_tool_knows(tmp_path, tool, end
     options, source, target, began = tool_request(tool)
     assert Path(source).is_absolute() and source.endswith(f".{ending}") and bytes.fromhex(began) == content[:32]
     assert (source == str(path)) == named and not Path(target).exists() and "--quiet" in options
+
+
+def test_of_an_error_without_a_text_its_type_is_told_and_not_how_long_it_took():
+    trace = "\n    at Gunzip.onerror (node:internal/streams:149:14)\n✗ failed in 0.211s  [peak cpu=88.9MB]\n"
+    assert reason_in("  ✗ TypeError" + trace) == "TypeError" and reason_in("✗ RangeError: too long" + trace) == "too long"
+    assert reason_in("✗ failed in 0.2s") == "✗ failed in 0.2s" and reason_in("") == ""
 
 
 def test_what_the_tool_refuses_is_one_sentence(tmp_path, tool):
