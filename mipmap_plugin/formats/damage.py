@@ -33,7 +33,7 @@ def damage_of(path: Path) -> str:
 
 
 def _damage_of_gzip(path: Path, most: int) -> str:
-    """What is wrong with a gzip stream, which may have `most` bytes unpacked; "" if nothing, or if it is none. What follows it does not count."""
+    """What is wrong with a gzip stream, which may have `most` bytes unpacked; "" if nothing, or if it is none. Another stream may follow it."""
     with path.open("rb") as file:
         if file.read(2) != GZIP:
             return ""
@@ -43,4 +43,7 @@ def _damage_of_gzip(path: Path, most: int) -> str:
             size += len(stream.decompress(block))
             if size > most:
                 return TOO_LARGE
-    return "" if stream.eof else "it is cut off"
+        rest = stream.unused_data or file.read(len(GZIP))
+    if not stream.eof:
+        return "it is cut off"
+    return "" if not rest or rest.startswith(GZIP) else "other bytes follow its end"

@@ -92,10 +92,15 @@ def test_a_sog_whose_checksums_are_wrong_is_refused(tmp_path, tool):
         load_model(tmp_path / "a.sog")
 
 
-def test_a_gzipped_spz_that_is_cut_off_is_said_to_be(tmp_path, tool):
+@pytest.mark.parametrize(
+    ("content", "why"), [(gzip.compress(SPZ)[:-12], "it is cut off"), (gzip.compress(SPZ) + b"ab", "other bytes follow its end")]
+)
+def test_what_is_wrong_with_a_gzipped_spz_is_said(tmp_path, tool, content, why):
     """splat-transform told its time and memory, in place of a reason."""
-    (tmp_path / "a.spz").write_bytes(gzip.compress(SPZ)[:-12])
-    assert sentence(tmp_path / "a.spz") == f"{tmp_path / 'a.spz'} is damaged (it is cut off); download or export it again"
+    (tmp_path / "a.spz").write_bytes(content)
+    assert sentence(tmp_path / "a.spz") == f"{tmp_path / 'a.spz'} is damaged ({why}); download or export it again"
+    (tmp_path / "a.spz").write_bytes(gzip.compress(SPZ) + gzip.compress(b""))
+    assert len(load_model(tmp_path / "a.spz")) == 60
 
 
 @pytest.mark.parametrize("packed", ["spz", "sog"])
