@@ -23,6 +23,7 @@ def values_of(data: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, An
     A frame's own intrinsics count for more, as in instant-ngp, unless the file is nerfstudio's, which takes the file's. But no training fits
     these to a frame of another size.
     """
+    data, frame = _stated(data), _stated(frame)
     if not any(key in data for key in OF_NERFSTUDIO) or any(frame[key] != data[key] for key in SIZE if key in frame and key in data):
         others = [key for key in FOCAL if FOCAL[0] in frame or FOCAL[1] in frame]  # of the file, which are of another lens
         return {**{key: value for key, value in data.items() if key not in others}, **frame}
@@ -34,4 +35,9 @@ def values_of(data: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, An
 def overruled(data: Mapping[str, Any], frame: Mapping[str, Any]) -> bool:
     """Whether a frame has intrinsics of its own that do not count."""
     values = values_of(data, frame)
-    return any(frame[key] != values.get(key) for key in (*SHARED, *SHARED_DISTORTION) if key in frame)
+    return any(value != values.get(key) for key, value in _stated(frame).items() if key in SHARED + SHARED_DISTORTION)
+
+
+def _stated(entries: Mapping[str, Any]) -> dict[str, Any]:
+    """Without those that are null."""
+    return {key: value for key, value in entries.items() if value is not None}

@@ -17,7 +17,7 @@ from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import ROTATION_TOLERANCE, numbers, pixels, positive, present, read_json, rotation
 from mipmap_plugin.scenes.base import ABSENT, Scene, refuse_other_shape
-from mipmap_plugin.scenes.cameras_json import numbers_views, trained_size
+from mipmap_plugin.scenes.cameras_json import numbers_views, principal_point, trained_size
 from mipmap_plugin.scenes.intrinsics import DISTORTION, overruled, values_of
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, can_undistort, note
 
@@ -131,7 +131,8 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
     views: list[View] = []
     places: list[PurePosixPath] = []
     absent, passed_over, trained = 0, 0, {_place(str(name)) for name in names} if isinstance(names := data.get("train_filenames"), list) else None
-    for index, frame in enumerate(frames):
+    tests = tests if isinstance(tests := data.get("test_frames"), list) else []  # of ScanNet++
+    for index, frame in enumerate([*frames, *tests]):
         where = f"{file}, frame {index}"
         if not isinstance(frame, dict):
             raise SceneError(f"{where}: is not a camera; export the file again")
@@ -144,7 +145,8 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
         actual = image_size(image) if image else stated  # the image may have been shrunk since
         if actual:
             name = image.stem if image else _stem(_place(listed).name)
-            split = split if trained is None else "train" if _place(listed) in trained else "test"
+            if trained is not None or index >= len(frames):
+                split = "train" if trained is not None and _place(listed) in trained else "test"
             if stated and image:
                 refuse_other_shape(stated, image, f"{where} ({name})")
             model = _lens_model(values, f"{where} ({name})")
@@ -154,8 +156,8 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
             places.append(_place(listed))
     unsized = absent - sum(image is None for _, image, _ in views)
     notes = [f"{file.name}: {_counted(absent)} {ABSENT}{_left_out(unsized)}"] if absent else []
-    whose = "has intrinsics of its own" if passed_over == 1 else "have intrinsics of their own"
-    notes += [f"{file.name}: of {len(frames)} frames {passed_over} {whose}, but the file's count, as in nerfstudio"] if passed_over else []
+    if passed_over:
+        notes.append(f"{file.name}: the intrinsics of {passed_over} of its frames are passed over for those of the file, as in nerfstudio")
     return views, places, notes
 
 
@@ -198,8 +200,7 @@ def _camera(values: Mapping[str, Any], size: tuple[int, int], name: str, split: 
     if fx is None:
         raise SceneError(f"{where}: has neither 'fl_x' nor 'camera_angle_x'; add one to the file")
     fy = _focal(values, "y", height, where) or fx
-    cx = numbers(values.get("cx", width / 2), (), f"{where}, cx").item()
-    cy = numbers(values.get("cy", height / 2), (), f"{where}, cy").item()
+    cx, cy = (principal_point(values.get(key), side, f"{where}, {key}") for key, side in (("cx", width), ("cy", height)))
     time = numbers(values["time"], (), f"{where}, time").item() if values.get("time") is not None else None
     return Camera(width, height, fx, fy, cx, cy, _viewmat(values, where), name, split, time)
 
