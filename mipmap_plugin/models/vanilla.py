@@ -237,7 +237,7 @@ class VanillaModel:
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
         """Check `path` as `save` would. Raises OutputExists, OutputError, SettingsError."""
         if is_written(path):
-            refuse_format(path, self.trained, self._parameters["means"])
+            refuse_format(path, self.trained, self._parameters)
         is_file = path.suffix.lower() == ".ply" or is_written(path)
         host = None if is_file else self._origin.host
         holds = host.holds(path) if host else None if is_file else "point_cloud"

@@ -180,10 +180,9 @@ def moved_by(offset):
     return VanillaModel.from_gaussians(replace(splats, means=splats.means + splats.means.new_tensor([0.0, 0.0, offset])))
 
 
-def test_spz_is_not_written_of_splats_that_are_too_far_away_for_it(tmp_path, tool):
-    """They would leave fewer bits for fractions than the 12 that other writers have, for all positions."""
-    far = moved_by(-2060.0)
-    refused = r"60 of 60 splats lie 2,048 or more units from the origin .* 1/4096 unit; remove them, .*shrink the scene, or give a .sog or a .ply"
+@pytest.mark.parametrize(("offset", "why"), [(-5e5, r"500,00\d .* 0.0625 unit, more than half the size of 45 of 60"), (9e6, "9,000,00.* no room")])
+def test_spz_is_not_written_of_splats_that_are_too_far_away_for_it(tmp_path, tool, offset, why):
+    far, refused = moved_by(offset), f"{why}.*; remove what lies far away, move or shrink the scene, or give a .sog or a .ply"
     with pytest.raises(SettingsError, match=refused):
         far.save(tmp_path / "out.spz", provenance={})
     with pytest.raises(SettingsError, match=refused):  # before any work
@@ -193,7 +192,13 @@ def test_spz_is_not_written_of_splats_that_are_too_far_away_for_it(tmp_path, too
         write_tile(tmp_path / "out.ply", tmp_path / "out.glb")
     assert not (tmp_path / "out.glb").exists()
     far.save(tmp_path / "out.compressed.ply", provenance={})
-    moved_by(2000.0).save(tmp_path / "out.spz", provenance={})
+
+
+def test_a_splat_far_away_takes_no_spz_from_a_scene_whose_splats_are_larger_than_its_steps(tmp_path, tool):
+    """Other writers keep 12 bits of fractions, so that nothing was written of splats 2,048 units away or more; the format has room for fewer."""
+    model = VanillaModel.from_gaussians(tiny.gaussians())
+    model.parameters()["means"].data[0] = 5000.0
+    assert model.save(tmp_path / "out.spz", provenance={}).is_file()
 
 
 @pytest.mark.parametrize("name", ["a.sog", "a.spz", "a.glb", "a.compressed.ply"])
@@ -208,7 +213,7 @@ def test_levels_in_tiles_are_refused_of_such_splats_before_any_work(tmp_path, to
     monkeypatch.setattr("mipmap_plugin.levels.ladder.make_levels", None)
     moved_by(5e5).save(tmp_path / "city.ply", provenance={})
     assert main(["levels", str(tmp_path / "city.ply"), "--viewer", "cesium", "--output", str(tmp_path / "ladder"), "--tiles"]) == 2
-    assert "60 of 60 splats lie 2,048 or more units" in (told := capsys.readouterr().err) and "leave --tiles out" in told
+    assert "more than half the size of 45 of 60 splats" in (told := capsys.readouterr().err) and "leave --tiles out" in told
 
 
 def test_a_splat_transform_that_is_too_old_for_sog_is_found_before_the_work(tmp_path, tool):
