@@ -83,6 +83,13 @@ def test_a_plain_ply_with_the_name_of_a_compressed_one_stays_plain(tmp_path):
     assert adapted_name(packed, 1 / 4) == "b_x0.25.compressed.ply"
 
 
+@pytest.mark.parametrize(("name", "adapted"), [("phone.bin", "phone_x0.25.ply"), ("phone", "phone_x0.25.ply"), ("phone.SPZ", "phone_x0.25.SPZ")])
+def test_the_adaptation_of_a_file_with_another_ending_is_a_ply(tmp_path, name, adapted):
+    """It was a folder whose name had the ending in its middle."""
+    (tmp_path / name).write_bytes(SPZ)
+    assert adapted_name(tmp_path / name, 1 / 4).lower() == adapted.lower()
+
+
 def test_a_sog_whose_checksums_are_wrong_is_refused(tmp_path, tool):
     with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
         archive.writestr("meta.json", json.dumps({"version": 2, "means": {"files": ["means_l.webp"]}}))
