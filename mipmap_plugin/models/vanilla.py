@@ -219,7 +219,7 @@ class VanillaModel:
                 warnings.warn(lost, stacklevel=2)
             exchanged = self._columns(parameters | {"shN": parameters["shN"][:, : (MOST_BANDS + 1) ** 2 - 1]})
             if is_glb(path):
-                return write_glb(path, exchanged, overwrite=overwrite)
+                return write_glb(path, exchanged, comments, overwrite=overwrite)
             return write_exchange(path, lambda ply: write_ply(ply, exchanged, comments), overwrite=overwrite)
         if self._origin.host and path.suffix.lower() != ".ply":
             return self._origin.host.write(path, parameters, comments, overwrite=overwrite)
