@@ -29,6 +29,11 @@ def test_a_size_that_is_none_is_refused(text):
         read_size(text)
 
 
+def test_what_a_format_cannot_hold_is_not_said_of_the_file_that_only_its_size_is_asked_of(recwarn):
+    """It was said twice, of different numbers of splats."""
+    assert splats_within(tiny.model(500, degree=4), 10**9, "a.glb", {}) == 500 and not recwarn.list
+
+
 @pytest.mark.parametrize("scale", [0.05, 0.2, 0.39, 0.41, 0.6, 0.7])
 def test_the_zoom_of_a_count_is_that_at_which_the_recipe_keeps_it(scale):
     assert scale_of_fraction(recipe("default", scale).merge_to) == pytest.approx(scale)

@@ -20,6 +20,8 @@ from mipmap_plugin.formats.gltf import read_gltf
 from mipmap_plugin.formats.readers import refuse_unread
 from mipmap_plugin.models import detect, load_model
 from mipmap_plugin.models.adapted_name import adapted_name
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting.harmonics import basis
 from mipmap_plugin.splatting.projection import axes_of
 
@@ -203,6 +205,20 @@ def test_what_is_written_is_read_again(tmp_path, degree):
     assert_moved(load_model(written).gaussians(), before, torch.eye(3))
     with pytest.raises(OutputExists):
         model.save(written, provenance={})
+
+
+@pytest.mark.parametrize("screen_filter", ["classic", "antialiased"])
+def test_how_splats_are_to_be_drawn_is_written_and_read(tmp_path, screen_filter):
+    """As in all other formats; it was lost, and the file taken for one of classic renderers."""
+    model = VanillaModel.from_gaussians(tiny.gaussians(), trained=TrainedScale(screen_filter))
+    assert load_model(model.save(tmp_path / "a.glb", provenance={})).trained.screen_filter == screen_filter
+
+
+@pytest.mark.parametrize("wrong", [7, {"SplatRenderMode": 7}, {"SplatRenderMode": "unheard"}, []])
+def test_other_facts_about_a_file_are_not_looked_at(tmp_path, wrong):
+    made, data = gltf_files.document(gltf_files.attributes(tiny.gaussians()))
+    path = gltf_files.write_glb(tmp_path / "a.glb", changed(made, "asset", to={"version": "2.0", "extras": wrong}), data)
+    assert load_model(path).trained == TrainedScale()
 
 
 def test_high_bands_and_columns_have_no_place(tmp_path):

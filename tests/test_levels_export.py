@@ -159,6 +159,14 @@ def test_a_tile_is_a_glb_of_spz(ladder, tool, tmp_path):
     assert not list(tmp_path.glob("*.spz"))
 
 
+def test_a_tile_tells_what_its_spz_cuts_off(ladder, tool, tmp_path):
+    model = load_model(ladder / "level_1.ply")
+    model.parameters()["scales"].data[:2] = 7.0
+    model.save(tmp_path / "huge.ply", provenance={})
+    with pytest.warns(UserWarning, match=r"^tile.glb: SPZ cuts off, of 60 splats, 2 longer than 379 units; a .ply keeps them$"):
+        write_tile(tmp_path / "huge.ply", tmp_path / "tile.glb")
+
+
 @pytest.mark.parametrize("write", [write_tiles, write_streamed])
 def test_bands_that_splat_transform_does_not_read_are_left_out_with_a_warning(ladder, tool, write):
     (level := ladder / LADDER["levels"][0]["file"]).unlink()

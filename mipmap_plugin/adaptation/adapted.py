@@ -30,7 +30,7 @@ from mipmap_plugin.models import contract, load_model
 from mipmap_plugin.models.base import SplatModel, checked_splats, effects_of, tensors_of
 from mipmap_plugin.models.exposure import exposed
 from mipmap_plugin.models.mip import for_loader_of, unread
-from mipmap_plugin.models.outputs import drawn_otherwise, parts_of, without_place
+from mipmap_plugin.models.outputs import cut_off, drawn_otherwise, parts_of, without_place
 from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.plugin_errors import naming_any, unchanged
 from mipmap_plugin.process.torch_modes import in_usual_modes, usual_modes
@@ -132,6 +132,7 @@ class Adapted:
     def report_of(self, path: Path) -> Report:
         """The report of the file at `path`, which also says what its format rounds, what it has no place for, and who draws it otherwise."""
         left_out = without_place(path, getattr(self.model, "extras", ()), getattr(self.model, "sh_degree", 0))
+        left_out = "; ".join(filter(None, (left_out, cut_off(path, self.model.parameters()))))
         lost = filter(None, (left_out, unread(self.report.viewer, self.model, path), self._rounded(path), self._drawn_otherwise(path)))
         moved = self.model.traits.placed and (path.suffix.lower() == ".ply" or is_written(path))  # which does not say where the cameras go
         cameras_from = {} if moved else self.report.cameras_from

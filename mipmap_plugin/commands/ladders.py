@@ -81,7 +81,7 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     if bound:
         raise SettingsError(f"{SINGLE_LEVEL}; give a smaller {bound}, or leave --streamed-sog out")
     if exports.tiles and not wrapped.model.traits.no_viewer:
-        refuse_far(output, wrapped.model.parameters()["means"], "leave --tiles out")
+        refuse_far(output, wrapped.model.parameters(), "leave --tiles out")
     if not wrapped.cameras:
         warnings.warn(NO_CAMERAS, stacklevel=2)
     ladder = _made(wrapped, request, unfinished)

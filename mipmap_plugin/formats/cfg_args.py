@@ -12,6 +12,9 @@ from mipmap_plugin.formats.magic import read_head
 # Bytes; real files have 200 to 2,000. Parsing time and depth grow with the text.
 MAX_SIZE = 64 * 1024
 
+# Of a copy: bytes that are not UTF-8 are kept as they are.
+ENCODING = {"encoding": "utf-8", "errors": "surrogateescape"}
+
 
 def read_cfg_args(path: str | Path) -> dict[str, Any]:
     """The options of `Namespace(key=literal, ...)`, without those whose values are not literals. Raises CheckpointError for other text."""
@@ -25,10 +28,16 @@ def read_cfg_args_and_rest(path: str | Path) -> tuple[dict[str, Any], list[str]]
     if len(text) > MAX_SIZE:
         raise CheckpointError(f"{path} has more than {MAX_SIZE // 1024} kB, which no cfg_args has; it is not read")
     try:
-        call = ast.parse(text.decode("utf-8").strip(), mode="eval").body
+        # Windows may write paths in another encoding, of which only the letters are lost here, and its editors begin with a byte-order mark.
+        call = ast.parse(text.decode("utf-8-sig", "replace").strip(), mode="eval").body
         return _keywords(call)
     except (SyntaxError, ValueError, TypeError, RecursionError, MemoryError) as error:
         raise CheckpointError(f"{path} is not a plain `Namespace(name=literal, ...)`, and is not executed: {brief(error)}") from error
+
+
+def cfg_args_text(path: Path) -> str:
+    """The whole text of a file, to be written again with the same encoding, `ENCODING`: every byte is kept."""
+    return path.read_bytes().decode(**ENCODING)
 
 
 def format_cfg_args(options: dict[str, Any]) -> str:

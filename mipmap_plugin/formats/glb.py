@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,8 @@ import numpy as np
 
 from mipmap_plugin.errors import OutputError
 from mipmap_plugin.formats.atomic import new_file
-from mipmap_plugin.formats.gltf import BINARY_CHUNK, DISPLAY, JSON_CHUNK, MAGIC, SPLATTING
+from mipmap_plugin.formats.gltf import BINARY_CHUNK, DISPLAY, JSON_CHUNK, MAGIC, MODE, SPLATTING
+from mipmap_plugin.formats.tags import render_mode
 
 # glTF's code of float32, and what its vectors are called by their lengths.
 FLOAT, VECTORS = 5126, {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
@@ -23,8 +24,10 @@ FLOAT, VECTORS = 5126, {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 MOST_BYTES = 2**32 - 2**16
 
 
-def write_glb(path: Path, columns: Mapping[str, np.ndarray], *, overwrite: bool = False) -> Path:
+def write_glb(path: Path, columns: Mapping[str, np.ndarray], comments: Iterable[str] = (), *, overwrite: bool = False) -> Path:
     """Write the columns of a 3DGS PLY, [N] each and finite, as one mesh, atomically; return `path`. Raises OutputExists, OutputError.
+
+    `comments`: of that PLY; how they say that it is to be drawn (`render_mode`) is written, if it is not as usual.
 
     All is turned by half a turn about z: glTF has y up, and a PLY mostly y down.
     """
@@ -46,7 +49,7 @@ def write_glb(path: Path, columns: Mapping[str, np.ndarray], *, overwrite: bool 
     if size > MOST_BYTES:
         raise OutputError(f"{path}: a .glb holds at most 4 GiB, and these {len(named['POSITION']):,} splats take {size / 2**30:.1f}; give a .ply")
     with new_file(path, overwrite) as temporary, temporary.open("wb") as file:
-        file.write(before_binary(_document(named), size))
+        file.write(before_binary(_document(named, {"antialiased": "mip", "2dgs": "2dgs"}.get(render_mode(comments) or "")), size))
         for array in named.values():
             file.write(array.tobytes())
     return path
@@ -60,8 +63,8 @@ def before_binary(document: dict[str, Any], size: int) -> bytes:
     return head + struct.pack("<I4s", len(text), JSON_CHUNK) + text + struct.pack("<I4s", size, BINARY_CHUNK)
 
 
-def _document(named: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """The JSON of one mesh with these attributes, whose bytes follow one another."""
+def _document(named: Mapping[str, np.ndarray], mode: str | None) -> dict[str, Any]:
+    """The JSON of one mesh with these attributes, whose bytes follow one another, and of how it is to be drawn."""
     starts = np.cumsum([0, *(array.nbytes for array in named.values())]).tolist()
     accessors: list[dict[str, Any]] = [
         {"bufferView": number, "componentType": FLOAT, "count": len(array), "type": VECTORS[array.shape[1]]}
@@ -71,7 +74,7 @@ def _document(named: Mapping[str, np.ndarray]) -> dict[str, Any]:
     splatting = {"kernel": "ellipse", "colorSpace": DISPLAY[0], "sortingMethod": "cameraDistance", "projection": "perspective"}
     primitive = {"mode": 0, "attributes": {name: number for number, name in enumerate(named)}, "extensions": {SPLATTING: splatting}}
     return {
-        "asset": {"version": "2.0", "generator": "mipmap_plugin"}, "extensionsUsed": [SPLATTING],
+        "asset": {"version": "2.0", "generator": "mipmap_plugin", **({"extras": {MODE: mode}} if mode else {})}, "extensionsUsed": [SPLATTING],
         "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "meshes": [{"primitives": [primitive]}], "accessors": accessors,
         "bufferViews": [{"buffer": 0, "byteOffset": start, "byteLength": end - start} for start, end in pairwise(starts)],
         "buffers": [{"byteLength": starts[-1]}],

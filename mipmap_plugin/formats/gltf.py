@@ -40,6 +40,9 @@ NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126
 LENGTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\0"
 
+# What `formats.glb` calls the way in which splats are to be drawn, for which glTF has no word, among the further facts about a file.
+MODE = "SplatRenderMode"
+
 # Whatever a damaged document makes of the code that follows its references.
 DAMAGE = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RecursionError, struct.error)
 
@@ -52,11 +55,13 @@ class Splats:
         matrix: [4, 4] f8, from their coordinates to those of the scene, which has y up.
         attributes: Arrays [N, ...] f4 by their names without a prefix: POSITION, ROTATION (xyzw), SCALE, OPACITY, SH_DEGREE_0_COEF_0, COLOR_0, ...
         spz: The bytes of an SPZ file that holds them instead; None: none does.
+        mode: How they are to be drawn, as comments of a PLY say it; None: the file does not say.
     """
 
     matrix: np.ndarray
     attributes: dict[str, np.ndarray] = field(default_factory=dict)
     spz: bytes | None = None
+    mode: str | None = None
 
 
 def read_gltf(path: Path) -> tuple[list[Splats], list[Path]]:
@@ -120,7 +125,10 @@ class _Document:
         if compression is not None:
             return Splats(matrix, spz=bytes(self._view(compression["bufferView"])))
         named = {name.removeprefix(f"{SPLATTING}:").removeprefix("_"): index for name, index in attributes.items()}
-        return Splats(matrix, {name: self._array(index) for name, index in named.items() if NEEDED.fullmatch(name)})
+        arrays = {name: self._array(index) for name, index in named.items() if NEEDED.fullmatch(name)}
+        facts = self._json.get("asset", {}).get("extras")
+        mode = facts.get(MODE) if isinstance(facts, dict) else None
+        return Splats(matrix, arrays, mode=mode if isinstance(mode, str) else None)
 
     def _refuse(self, said: dict[str, Any]) -> None:
         """Raise CheckpointError for splats that are no Gaussians in display colors, as the extension's basis describes them."""

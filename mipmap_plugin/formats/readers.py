@@ -19,8 +19,12 @@ KIRI = "KIRI's add-on for Blender reads PLYs only"
 PLY_ONLY = ("3dgs.cpp", "web-splat", "splatapult")
 
 
+# Viewers that open no file of splats by itself.
+TILES_ONLY = {"cesium": "Cesium opens splats in 3D Tiles only, which levels --tiles writes"}
+
+
 def _read_no(ending: str, *viewers: str) -> dict[str, str]:
-    told = {"mip": NOT_IN_PLY.format(ending), "kiri": KIRI}
+    told = {"mip": NOT_IN_PLY.format(ending), "kiri": KIRI, **TILES_ONLY}
     told |= dict.fromkeys(
         ("antimatter15", "aframe", "gsplat-js"), f"antimatter15/splat, aframe-gaussian-splatting and gsplat.js read no {ending}"
     )
@@ -42,7 +46,7 @@ UNREAD: dict[str, dict[str, str]] = {
             for viewer in ("spark", "gaussian-splats-3d", "gsplat-js", "antimatter15", "aframe", "mip", "brush", "lichtfeld", "visionary", "unity",
                            "metalsplatter", "vk-gaussian-splatting", "gdgs", "kiri", *PLY_ONLY)
         },
-        "cesium": "Cesium draws no splats in glTF but SPZ, as levels --tiles writes them",
+        **TILES_ONLY,
     },
 }  # fmt: skip
 
@@ -55,10 +59,15 @@ PARTLY = {
 
 
 def refuse_unread(path: Path, viewers: Sequence[str]) -> None:
-    """Raise SettingsError for an output that none of the viewers it is made for reads; warn of one that only some of them read."""
+    """Raise SettingsError for an output that none of the viewers it is made for reads; warn of one that only some of them read.
+
+    Tiles may be made of a PLY or a folder, so that it is written for viewers that open tiles only, and warned of.
+    """
     unread, partly = ({viewer: told[viewer] for viewer in viewers if viewer in told} for told in (_told(path, UNREAD), _told(path, PARTLY)))
-    if reasons := "; ".join(dict.fromkeys([*unread.values(), *partly.values()])):
-        advice = f"{path}: {reasons}; give a .ply by --output"
+    if viewers and not unread and set(viewers) <= TILES_ONLY.keys():
+        warnings.warn(f"{path}: {TILES_ONLY[viewers[0]]}", stacklevel=3)
+    elif reasons := "; ".join(dict.fromkeys([*unread.values(), *partly.values()])):
+        advice = f"{path}: {reasons}" + ("" if set(viewers) <= TILES_ONLY.keys() else "; give a .ply by --output")
         if len(unread) == len(viewers):
             raise SettingsError(advice)
         warnings.warn(f"{advice} if it is for these too", stacklevel=3)

@@ -18,6 +18,7 @@ import numpy as np
 from mipmap_plugin.formats.codebooks import codebook, palette
 from mipmap_plugin.formats.images import lossless_webp
 from mipmap_plugin.formats.tags import DAMAGE, meta_of_sog
+from mipmap_plugin.formats.zipped import FULL
 
 # Entries of the table of spherical harmonics: their numbers have 16 bits, and 64 of them lie in a row.
 MOST_ENTRIES, IN_A_ROW = 1 << 16, 64
@@ -77,31 +78,45 @@ def write_sog(path: Path, columns: Mapping[str, np.ndarray], *, antialiased: boo
 
 
 def completed(source: Path, folder: Path) -> Path:
-    """A SOG that says how many entries its table of harmonics has: `source`, which is an archive or a meta.json, or a copy of it in `folder`.
+    """A SOG that splat-transform reads, and reads whole: `source`, which is an archive or a meta.json, or a copy of it in `folder`.
 
-    LichtFeld Studio wrote `palette_size` for `count` in 2025. Without that, splat-transform reads harmonics as 0.
+    LichtFeld Studio wrote `palette_size` in 2025 for the number of entries in the table of harmonics, `count`, without which splat-transform reads
+    harmonics as 0. A folder that was packed as such lies in a folder of its archive. Raises OSError where the disk is full.
     """
     try:
-        meta = meta_of_sog(source)
-        table = meta.get("shN")
-        if meta.get("version") != 2 or not table or "count" in table:
+        meta, packed = meta_of_sog(source), zipfile.is_zipfile(source)
+        within, table = _folder_in(source) if packed else "", meta.get("shN")
+        lacks_count = meta.get("version") == 2 and table and "count" not in table
+        if not lacks_count and not within:
             return source
-        text = json.dumps({**meta, "shN": {**table, "count": table.get("palette_size", MOST_ENTRIES)}})
-        if zipfile.is_zipfile(source):
-            return _with_meta(source, folder / "completed.sog", text)
+        if lacks_count:
+            meta = {**meta, "shN": {**table, "count": table.get("palette_size", MOST_ENTRIES)}}
+        if packed:
+            return _with_meta(source, folder / "completed.sog", within, json.dumps(meta))
         for name in (Path(name).name for part in meta.values() if isinstance(part, dict) for name in part.get("files", ())):
             shutil.copyfile(source.with_name(name), folder / name)
         copy = folder / source.name
-        copy.write_text(text)
+        copy.write_text(json.dumps(meta))
         return copy
-    except DAMAGE:
+    except DAMAGE as error:
+        if isinstance(error, OSError) and error.errno in FULL:
+            raise  # without its copy the file would be read with wrong colors
         return source  # of which splat-transform tells
 
 
-def _with_meta(source: Path, copy: Path, text: str) -> Path:
+def _folder_in(source: Path) -> str:
+    """The folder of an archive in which its only SOG lies, with a slash; "" for none, and where there are several."""
+    with zipfile.ZipFile(source) as archive:
+        folders = [place + slash for place, slash, leaf in (name.rpartition("/") for name in archive.namelist()) if leaf == "meta.json"]
+    return folders[0] if len(folders) == 1 else ""
+
+
+def _with_meta(source: Path, copy: Path, within: str, text: str) -> Path:
+    """A copy of what lies in a folder of an archive, with another meta.json."""
     with zipfile.ZipFile(source) as archive, zipfile.ZipFile(copy, "w") as out:
         for name in archive.namelist():
-            out.writestr(name, text if name.rpartition("/")[2] == "meta.json" else archive.read(name))
+            if name.startswith(within) and name != within:
+                out.writestr(name.removeprefix(within), text if name == f"{within}meta.json" else archive.read(name))
     return copy
 
 

@@ -10,8 +10,6 @@ import re
 import shutil
 import subprocess
 import tempfile
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -131,9 +129,12 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
         plain = Path(folder, "plain.ply")
         if reason := _run(tool, [_completed(source, Path(folder)) if kind == "sog" else source], plain):
             raise CheckpointError(f"{path} is {name}, but {TOOL} does not read it ({reason}); export it again")
-        _settle_frame(tool, source, plain)
-        _settle_mode(_mode(source, kind), plain)
-        yield plain
+        try:
+            _settle_frame(tool, source, plain)
+            _settle_mode(_mode(source, kind), plain)
+            yield plain
+        except CheckpointError as error:
+            raise CheckpointError(str(error).replace(str(plain), f"{path}, as {TOOL} reads it")) from error
 
 
 def _completed(source: Path, folder: Path) -> Path:
@@ -143,15 +144,9 @@ def _completed(source: Path, folder: Path) -> Path:
 
 
 def _damage(path: Path) -> str:
-    """What is wrong with a file that is a zip archive, as a SOG is; "" if nothing. The tool does not look at its checksums."""
-    if not zipfile.is_zipfile(path):
-        return ""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            wrong = archive.testzip()
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError) as error:
-        return str(error)
-    return f"the checksum of {wrong} is wrong" if wrong else ""
+    from mipmap_plugin.formats.damage import damage_of  # and NumPy, as above
+
+    return damage_of(path)
 
 
 def write_exchange(path: Path, write: Callable[[Path], Any], *, overwrite: bool) -> Path:
@@ -268,4 +263,5 @@ def reason_in(said: str) -> str:
     """What splat-transform says went wrong: its line with the error, before a trace and a summary, or else its last one."""
     lines = [line.strip() for line in said.splitlines() if line.strip()]
     errors = [found[1] for line in lines if (found := re.search(r"Error(?: \[\w+\])?: (.*)", line))]
-    return (errors[0] if errors else lines[-1] if lines else "")[:160]
+    others = [line.removeprefix("✗ ") for line in lines if not re.match("at |✗ failed in ", line)]  # an error may have no text but its type
+    return (errors or others[-1:] or lines[-1:] or [""])[0][:160]

@@ -40,10 +40,14 @@ def refine(file: Path, columns: Mapping[str, np.ndarray]) -> None:
     file.write_bytes(gzip.compress(header + places + middle + harmonics, mtime=0))
 
 
+def fraction_for(farthest: float) -> int:
+    """How many bits of fractions fit for coordinates up to `farthest`; below 0 where none does."""
+    return min(MOST_FRACTION, math.floor(math.log2(LARGEST_POSITION / max(farthest, 2.0**-MOST_FRACTION))))
+
+
 def _positions(means: np.ndarray) -> tuple[int, bytes]:
     """How many bits of fractions fit for positions [N, 3], and these in so many: 9 bytes each."""
-    farthest = float(np.abs(means).max(initial=2.0**-MOST_FRACTION))
-    fraction = min(MOST_FRACTION, math.floor(math.log2(LARGEST_POSITION / farthest)))
+    fraction = fraction_for(float(np.abs(means).max(initial=0.0)))
     codes: np.ndarray = np.rint(means.astype(np.float64) * 2.0**fraction).astype("<i4")
     return fraction, codes.view(np.uint8).reshape(-1, 4)[:, :3].tobytes()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import tempfile
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -78,7 +79,9 @@ def splats_within(model: SplatModel, size: int, name: str, record: dict[str, Any
     with tempfile.TemporaryDirectory(prefix=TEMPORARY) as folder:
         every = Path(folder, f"all{ending}" if ending else f"all_{name}")  # a third-party family may know its files by their ending
         try:
-            own = contract.save(for_loader_of(record.get("viewer"), model, every), every, record)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # what this format cannot hold is said of the file that is kept
+                own = contract.save(for_loader_of(record.get("viewer"), model, every), every, record)
         except MipmapPluginError as error:
             raise type(error)(str(error).replace(str(every), name)) from error
         besides, all_of_them = read_header(own).body if own.suffix == ".ply" else 0, own.stat().st_size

@@ -13,6 +13,7 @@ from __future__ import annotations
 import gzip
 import shutil
 import struct
+import warnings
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
@@ -32,7 +33,7 @@ from mipmap_plugin.levels.exported import readable
 from mipmap_plugin.levels.manifest import read_manifest
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import SplatModel
-from mipmap_plugin.models.outputs import refuse_far
+from mipmap_plugin.models.outputs import cut_off, refuse_far
 
 TILES, TILESET = "tiles", "tileset.json"
 
@@ -91,8 +92,11 @@ def _bounds(model: SplatModel) -> tuple[Tensor, Tensor]:
 
 def write_tile(ply: Path, tile: Path) -> None:
     """Write a GLB of the splats of a PLY. Raises SettingsError without splat-transform and for splats too far away, OutputError."""
-    compressed, means = tile.with_suffix(".spz"), load_model(ply).parameters()["means"].detach()
-    refuse_far(tile, means, "open the level itself")
+    compressed, parameters = tile.with_suffix(".spz"), load_model(ply).parameters()
+    means = parameters["means"].detach()
+    if lost := cut_off(compressed, parameters):
+        warnings.warn(f"{tile.name}: {lost}", stacklevel=2)
+    refuse_far(tile, parameters, "open the level itself")
     with TemporaryDirectory(prefix=TEMPORARY) as folder:
         write_exchange(compressed, partial(shutil.copyfile, readable(ply, Path(folder, ply.name))), overwrite=False)
     tile.write_bytes(glb(compressed.read_bytes(), means.amin(dim=0).tolist(), means.amax(dim=0).tolist()))

@@ -19,9 +19,9 @@ COMPRESSED = EXCHANGE["compressed"][1]
 def adapted_name(checkpoint: Path, scale: float, viewer: str | None = None) -> str:
     """NAME_x0.25 or NAME_x0.25_spark, with the ending of what is saved; none for a folder.
 
-    Exchange formats that can only be read are written as a PLY, as is a PLY in a zip archive. glTF is written as .glb, but as a PLY for a viewer
-    that does not read that, and files of third-party families as these say (`Family.saves`), but as a PLY for any. Files that other projects save
-    with torch become a folder, as those of INRIA are.
+    Exchange formats that can only be read, or have another ending, are written as a PLY, as is a PLY in a zip archive. glTF is written as .glb, but
+    as a PLY for a viewer that does not read that, and files of third-party families as these say (`Family.saves`), but as a PLY for any. Files that
+    other projects save with torch become a folder, as those of INRIA are.
     """
     name = checkpoint.resolve().name
     read, written = _endings(checkpoint, name, viewer)
@@ -52,6 +52,6 @@ def _endings(checkpoint: Path, name: str, viewer: str | None) -> tuple[str, str]
     if opened(checkpoint) != checkpoint:  # a folder in a zip archive
         return Path(name).suffix, ""
     if family in BUILT_IN:
-        return (Path(name).suffix, ".ply") if family.name in ("zipped", "gltf") else ("", "")
+        return (Path(name).suffix, ".ply") if family.name in ("zipped", "gltf", "exchange") else ("", "")
     own = Path(name).suffix if family.saves is None else family.saves
     return Path(name).suffix, own if viewer is None else ".ply"

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mipmap_plugin.errors import TEMPORARY, CheckpointError, ShapeError, brief
 from mipmap_plugin.formats.atomic import sha256
-from mipmap_plugin.formats.gltf import read_gltf
+from mipmap_plugin.formats.gltf import MODE, read_gltf
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.splat_transform import as_ply
 from mipmap_plugin.models.columns import to_parameters
@@ -36,7 +36,8 @@ def load_gltf(path: str | Path, *, iteration: int | None = None) -> VanillaModel
     primitives, files = read_gltf(file)
     parts, comments = [], list[tuple[str, ...]]()
     for splats in primitives:
-        raw, said = (_raw(splats.attributes, file), ()) if splats.spz is None else _from_spz(splats.spz, file)
+        told = () if splats.mode is None else (f"{MODE}: {splats.mode}",)
+        raw, said = (_raw(splats.attributes, file), told) if splats.spz is None else _from_spz(splats.spz, file)
         parts.append(_placed(raw, FROM_SCENE @ splats.matrix, file))
         comments.append(said)
     trained = {trained_scale({}, said) for said in comments}

@@ -202,12 +202,15 @@ def drop(model: Model, mask: Tensor, why: str, source: Path | str | None) -> Mod
 
 
 def without_invalid(model: Model) -> Model:
-    """The model without splats that are not finite once activated, with a note. Raises CheckpointError if none or few are left (`refuse_few`).
+    """The model without splats that are not finite once activated, with a note. Raises CheckpointError if none or few are left (`refuse_few`),
+    and for a file without any.
 
     Once for each model it warns of what is doubtful (`Health.doubts`), such as positions that float32 does not hold: a file of doubles loses them
     only here.
     """
     health = examine(model)
+    if model.source is not None and not health.splats:
+        raise CheckpointError(f"{model.source} holds no splats; export it again")
     refuse_few(health.invalid, model.source)
     for doubt in health.doubts():
         if doubt not in model.notes:

@@ -9,7 +9,7 @@ from typing import Any, TypeGuard
 
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.atomic import new_folder
-from mipmap_plugin.formats.cfg_args import format_cfg_args, read_cfg_args_and_rest
+from mipmap_plugin.formats.cfg_args import ENCODING, cfg_args_text, format_cfg_args, read_cfg_args_and_rest
 from mipmap_plugin.formats.tags import recorded_filter, render_mode
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
@@ -90,7 +90,7 @@ def write_folder(target: Path, source: Path | None, cfg_args: str, iteration: in
     with new_folder(target, overwrite) as fresh:
         (fresh / within).parent.mkdir(parents=True)
         write_ply(fresh / within)
-        (fresh / "cfg_args").write_text(cfg_args, encoding="utf-8", newline="")
+        (fresh / "cfg_args").write_text(cfg_args, **ENCODING, newline="")
         for name in COMPANIONS:
             if source is not None and (source / name).is_file():
                 shutil.copyfile(source / name, fresh / name)
@@ -107,7 +107,7 @@ def cfg_args_for(source: Path | None, target: Path, trained: TrainedScale, sh_de
     fits = not any(name in options for name in FILTER_OPTIONS) or _screen_filter(options, None) == (trained.screen_filter, trained.eps2d)
     options = {name: value for name, value in options.items() if fits or name not in FILTER_OPTIONS}
     if fits and source is not None and options.get("sh_degree") == sh_degree:
-        return (source / "cfg_args").read_bytes().decode("utf-8")
+        return cfg_args_text(source / "cfg_args")
     usual = {"source_path": "", "model_path": str(target), "images": "images", "resolution": trained.resolution, "data_device": "cuda", "eval": None}
     white = trained.background == (1.0, 1.0, 1.0)
     return format_cfg_args({**usual, "white_background": white, **options, "sh_degree": sh_degree})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -14,10 +15,11 @@ from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.formats.atomic import absolute, named, refuse_output, refuse_to_lose
 from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.formats.ply import read_header
-from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_glb, is_written, refuse_as_folder, refuse_exchange
+from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_glb, is_spz, is_written, refuse_as_folder, refuse_exchange
+from mipmap_plugin.formats.spz import fraction_for
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.health import rows_where
+from mipmap_plugin.models.health import COARSE_SHARE, COARSE_STEP, rows_where
 from mipmap_plugin.models.places import CONVERTED, PARTS, REPORT, STATE
 
 # What is written into a model folder, of all families.
@@ -26,8 +28,11 @@ WRITTEN = (
     "nerfstudio_models/*.ckpt", "deform/*/deform.pth", "point_cloud/*/point_cloud.ply", "point_cloud/*/*.pt", "point_cloud/*/*.pth", f"*{REPORT}",
 )  # fmt: skip
 
-# World units: a single splat farther away leaves SPZ fewer than the usual 12 bits for fractions of a unit, for the positions of all (`formats.spz`).
-SPZ_REACH = 2048.0
+# Bits of fractions of a unit that other writers of SPZ keep of all positions, and that a single splat 2,048 units away leaves (`formats.spz`).
+USUAL_FRACTION = 12
+
+# What SPZ stores: log scales, the size of the coefficients of degree 0 (whose color lies between -0.44 and 1.44), and that of all others.
+SPZ_LOG_SCALES, SPZ_COLOR, SPZ_HARMONICS = (-10.0, 5.9375), 0.5 / 0.15, 1.0
 
 # Finite numbers that in float32 activate as an infinite logit and logarithm do: to an opacity of 1 or 0, and a length of almost 0.
 LOGIT, LOG_SCALE = 80.0, -87.0
@@ -64,10 +69,10 @@ def _is_of_a_training(ply: Path) -> bool:
     return kind_of(ply) == "ply" and provenance_of(read_header(ply).comments) is None
 
 
-def refuse_format(path: Path, trained: TrainedScale, means: Tensor) -> None:
+def refuse_format(path: Path, trained: TrainedScale, parameters: Mapping[str, Tensor]) -> None:
     """Raise SettingsError for an exchange format at `path` if the splats need the screen filter of their training, or if it cannot be written, or has
-    no place for their centers `means` [N, 3], or if there are none."""
-    if not len(means):
+    no place for their centers, or if there are none. `parameters`: raw."""
+    if not len(parameters["means"]):
         raise SettingsError(f"{path}: there are no splats to write, which this format needs; give a .ply")
     if trained.keeps_filter:
         own = f"the filter of their own project ({trained.told()})"
@@ -75,14 +80,23 @@ def refuse_format(path: Path, trained: TrainedScale, means: Tensor) -> None:
     if not is_glb(path):
         refuse_exchange(path)
     if path.suffix.lower() == ".spz":
-        refuse_far(path, means, "give a .sog or a .ply")
+        refuse_far(path, parameters, "give a .sog or a .ply")
 
 
-def refuse_far(path: Path, means: Tensor, instead: str) -> None:
-    """Raise SettingsError for centers [N, 3] that SPZ has no place for. `instead`: what else can be done."""
-    if far := int((means.detach().abs() >= SPZ_REACH).any(dim=1).sum()):
-        where = f"lie {SPZ_REACH:,.0f} or more units from the origin along an axis, for which SPZ would round all positions to more than 1/4096 unit"
-        raise SettingsError(f"{path}: {far:,} of {len(means):,} splats {where}; remove them, move or shrink the scene, or {instead}")
+def refuse_far(path: Path, parameters: Mapping[str, Tensor], instead: str) -> None:
+    """Raise SettingsError for splats so far away that SPZ would round many positions by half of a size and more, or has no room for them.
+
+    `parameters`: raw. `instead`: what else can be done.
+    """
+    farthest, sizes = parameters["means"].detach().abs().amax().item(), parameters["scales"].detach().amax(dim=1).exp()
+    if not math.isfinite(farthest) or (fraction := fraction_for(farthest)) >= USUAL_FRACTION:  # of what is not finite `finite` tells
+        return
+    step = 2.0**-fraction
+    coarse = int((step > COARSE_STEP * sizes).sum())
+    if fraction < 0 or coarse > COARSE_SHARE * len(sizes):
+        rounded = f"would round positions to {step:g} unit, more than half the size of {coarse:,} of {len(sizes):,} splats"
+        where = f"a splat lies {farthest:,.0f} units from the origin along an axis, for which SPZ {'has no room' if fraction < 0 else rounded}"
+        raise SettingsError(f"{path}: {where}; remove what lies far away, move or shrink the scene, or {instead}")
 
 
 def without_place(path: Path, extras: Iterable[str], sh_degree: int) -> str:
@@ -94,6 +108,25 @@ def without_place(path: Path, extras: Iterable[str], sh_degree: int) -> str:
     without = "glTF has no place for" if is_glb(path) else f"{TOOL} does not write"
     lost += [f"SH bands above degree {MOST_BANDS} are dropped, which {without}; a .ply has them"] if sh_degree > MOST_BANDS else []
     return "; ".join(lost)
+
+
+def cut_off(path: Path, parameters: Mapping[str, Tensor]) -> str:
+    """How many of the splats with these raw `parameters` an SPZ at `path` cannot hold, even rounded, in a sentence; "" for any other format.
+
+    Of thin splats only the longest axis counts: the others are lengthened by less than anybody sees.
+    """
+    if not is_spz(path) or not {"scales", "sh0", "shN"} <= parameters.keys():
+        return ""
+    longest, (least, most) = parameters["scales"].detach().amax(dim=1), SPZ_LOG_SCALES
+    colors, harmonics = (parameters[name].detach().abs().flatten(1) for name in ("sh0", "shN"))
+    beyond = {
+        f"longer than {math.exp(most):,.0f} units": longest > most,
+        f"shorter than {math.exp(least):.2g} units": longest < least,
+        "with a color of degree 0 outside -0.44 to 1.44": (colors > SPZ_COLOR).any(dim=1),
+        "with other harmonics outside -1 to 1": (harmonics > SPZ_HARMONICS).any(dim=1),
+    }
+    found = ", ".join(f"{int(where.sum()):,} {what}" for what, where in beyond.items() if where.any())
+    return f"SPZ cuts off, of {len(longest):,} splats, {found}; a .ply keeps them" if found else ""
 
 
 def drawn_otherwise(path: Path, trained: TrainedScale) -> str:

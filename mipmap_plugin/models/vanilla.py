@@ -27,7 +27,7 @@ from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
 from mipmap_plugin.models.health import LARGEST
 from mipmap_plugin.models.hosts import Capture, Host
 from mipmap_plugin.models.inria_folder import cfg_args_for, write_folder
-from mipmap_plugin.models.outputs import finite, refuse_format, refuse_parts, without_place
+from mipmap_plugin.models.outputs import cut_off, finite, refuse_format, refuse_parts, without_place
 from mipmap_plugin.models.raw import check, log, logit, moved, raw_parameters
 from mipmap_plugin.splatting.bands import joined, neighbors
 from mipmap_plugin.splatting.rotations import unit_quaternions
@@ -215,11 +215,11 @@ class VanillaModel:
         parameters = finite(self._parameters, LARGEST)
         comments = with_tags(self._origin.comments, self.trained.screen_filter, provenance, self.trained.eps2d)
         if is_written(path):
-            if lost := without_place(path, self._origin.extras, self.sh_degree):
+            for lost in filter(None, (without_place(path, self._origin.extras, self.sh_degree), cut_off(path, parameters))):
                 warnings.warn(lost, stacklevel=2)
             exchanged = self._columns(parameters | {"shN": parameters["shN"][:, : (MOST_BANDS + 1) ** 2 - 1]})
             if is_glb(path):
-                return write_glb(path, exchanged, overwrite=overwrite)
+                return write_glb(path, exchanged, comments, overwrite=overwrite)
             return write_exchange(path, lambda ply: write_ply(ply, exchanged, comments), overwrite=overwrite)
         if self._origin.host and path.suffix.lower() != ".ply":
             return self._origin.host.write(path, parameters, comments, overwrite=overwrite)
@@ -237,7 +237,7 @@ class VanillaModel:
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
         """Check `path` as `save` would. Raises OutputExists, OutputError, SettingsError."""
         if is_written(path):
-            refuse_format(path, self.trained, self._parameters["means"])
+            refuse_format(path, self.trained, self._parameters)
         is_file = path.suffix.lower() == ".ply" or is_written(path)
         host = None if is_file else self._origin.host
         holds = host.holds(path) if host else None if is_file else "point_cloud"

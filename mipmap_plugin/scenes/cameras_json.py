@@ -177,11 +177,11 @@ def _camera(entry: dict[str, Any], name: str, split: Any, where: str) -> Camera:
     viewmat = viewmat_of(camera_to_world, position)
     width, height = (pixels(present(entry, key, where), f"{where}, {key}") for key in ("width", "height"))
     fx, fy = (positive(present(entry, key, where), f"{where}, {key}") for key in ("fx", "fy"))
-    cx, cy = (_principal_point(entry.get(key), side, f"{where}, {key}") for key, side in (("cx", width), ("cy", height)))
+    cx, cy = (principal_point(entry.get(key), side, f"{where}, {key}") for key, side in (("cx", width), ("cy", height)))
     return Camera(width, height, fx, fy, cx, cy, viewmat, name, split)
 
 
-def _principal_point(value: Any, side: int, where: str) -> float:
+def principal_point(value: Any, side: int, where: str) -> float:
     """px from the edge; the middle of the `side` (px) if there is no value. Raises SceneError for what seems to be in another unit."""
     if value is None:
         return side / 2

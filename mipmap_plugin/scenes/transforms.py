@@ -17,16 +17,13 @@ from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import ROTATION_TOLERANCE, numbers, pixels, positive, present, read_json, rotation
 from mipmap_plugin.scenes.base import ABSENT, Scene, refuse_other_shape
-from mipmap_plugin.scenes.cameras_json import numbers_views, trained_size
+from mipmap_plugin.scenes.cameras_json import numbers_views, principal_point, trained_size
+from mipmap_plugin.scenes.intrinsics import DISTORTION, overruled, values_of
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, can_undistort, note
 
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
-# Focal lengths: along x, by which a frame has a lens of its own, and along y.
-FOCAL = ("fl_x", "camera_angle_x", "fl_y", "camera_angle_y")
-
-DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+PERSPECTIVE_MODELS = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
 # The rotation that ns-process-data applied to COLMAP's world before its files recorded it (data/dataparsers/nerfstudio_dataparser.py).
 USUAL_TURN = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
@@ -55,11 +52,8 @@ def read_transforms(path: str | Path, cfg: dict[str, Any] | None = None) -> Scen
     notes: list[str] = []
     files = transforms_files(path)
     for file, split in files:
-        found, listed, absent = _read_file(file, split)
-        views, places = views + found, places + listed
-        if absent:
-            unsized = absent - sum(image is None for _, image, _ in found)
-            notes.append(f"{file.name}: {_counted(absent)} {ABSENT}{_left_out(unsized)}")
+        found, listed, said = _read_file(file, split)
+        views, places, notes = views + found, places + listed, notes + said
     if not views:
         raise SceneError(f"{path}: none of the listed images is there, and the sizes are unknown; add the images, or w and h to the file")
     if cfg:
@@ -127,8 +121,8 @@ def _left_out(unsized: int) -> str:
     return f"; {cameras} left out because the file has no w and h"
 
 
-def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View], list[PurePosixPath], int]:
-    """The usable views, the listed place of each one's image, and the number of listed images that are missing."""
+def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View], list[PurePosixPath], list[str]]:
+    """The usable views, the listed place of each one's image, and notes on images that are missing and intrinsics that do not count."""
     data = read_json(file)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
@@ -136,13 +130,14 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
         raise SceneError(f"{file}: {lacks}; give a NeRF-Synthetic, instant-ngp or nerfstudio transforms file")
     views: list[View] = []
     places: list[PurePosixPath] = []
-    absent, trained = 0, {_place(str(name)) for name in names} if isinstance(names := data.get("train_filenames"), list) else None
-    for index, frame in enumerate(frames):
+    absent, passed_over, trained = 0, 0, {_place(str(name)) for name in names} if isinstance(names := data.get("train_filenames"), list) else None
+    tests = tests if isinstance(tests := data.get("test_frames"), list) else []  # of ScanNet++
+    for index, frame in enumerate([*frames, *tests]):
         where = f"{file}, frame {index}"
         if not isinstance(frame, dict):
             raise SceneError(f"{where}: is not a camera; export the file again")
-        others = [key for key in FOCAL if FOCAL[0] in frame or FOCAL[1] in frame]  # of the file, which are of another lens
-        values = {**{key: value for key, value in data.items() if key not in others}, **frame}  # a frame's own intrinsics override the file's
+        values = values_of(data, frame)
+        passed_over += overruled(data, frame)
         listed = str(present(frame, "file_path", where))
         image = _image(file.parent, listed)
         absent += image is None
@@ -150,7 +145,8 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
         actual = image_size(image) if image else stated  # the image may have been shrunk since
         if actual:
             name = image.stem if image else _stem(_place(listed).name)
-            split = split if trained is None else "train" if _place(listed) in trained else "test"
+            if trained is not None or index >= len(frames):
+                split = "train" if trained is not None and _place(listed) in trained else "test"
             if stated and image:
                 refuse_other_shape(stated, image, f"{where} ({name})")
             model = _lens_model(values, f"{where} ({name})")
@@ -158,7 +154,11 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
             lens = _lens(values, model, camera, f"{where} ({name})")
             views.append((lens.straightened(camera) if lens and can_undistort() else camera, image, lens))
             places.append(_place(listed))
-    return views, places, absent
+    unsized = absent - sum(image is None for _, image, _ in views)
+    notes = [f"{file.name}: {_counted(absent)} {ABSENT}{_left_out(unsized)}"] if absent else []
+    if passed_over:
+        notes.append(f"{file.name}: the intrinsics of {passed_over} of its frames are passed over for those of the file, as in nerfstudio")
+    return views, places, notes
 
 
 def _applied(file: Path) -> tuple[Tensor | None, float]:
@@ -200,8 +200,7 @@ def _camera(values: Mapping[str, Any], size: tuple[int, int], name: str, split: 
     if fx is None:
         raise SceneError(f"{where}: has neither 'fl_x' nor 'camera_angle_x'; add one to the file")
     fy = _focal(values, "y", height, where) or fx
-    cx = numbers(values.get("cx", width / 2), (), f"{where}, cx").item()
-    cy = numbers(values.get("cy", height / 2), (), f"{where}, cy").item()
+    cx, cy = (principal_point(values.get(key), side, f"{where}, {key}") for key, side in (("cx", width), ("cy", height)))
     time = numbers(values["time"], (), f"{where}, time").item() if values.get("time") is not None else None
     return Camera(width, height, fx, fy, cx, cy, _viewmat(values, where), name, split, time)
 
@@ -249,14 +248,16 @@ def _focal(values: Mapping[str, Any], axis: str, size: int, where: str) -> float
 
 def _lens_model(values: Mapping[str, Any], where: str) -> str:
     """The name of the lens model. Raises SceneError if it is not perspective; such files state no focal length either."""
-    model = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
+    model = str(values.get("camera_model") or ("OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")).upper()
     if model not in (*PERSPECTIVE_MODELS, "OPENCV_FISHEYE"):
         raise SceneError(f"{where}: has a lens that is not perspective ({model}); resample its images to a pinhole first")
-    return str(model)
+    return model
 
 
 def _lens(values: Mapping[str, Any], model: str, camera: Camera, where: str) -> Lens | None:
     """The lens of a `camera` with distortion, with OpenCV's parameters; None for a pinhole."""
+    if listed := values.get("distortion_params"):  # nerfstudio's, which prefers them
+        values = dict(zip(DISTORTION, numbers(listed, (len(DISTORTION),), f"{where}, distortion_params").tolist(), strict=True))
     k1, k2, k3, k4, p1, p2 = (numbers(values.get(key) or 0.0, (), f"{where}, {key}").item() for key in DISTORTION)
     pinhole = (camera.fx, camera.fy, camera.cx, camera.cy)
     if model == "OPENCV_FISHEYE":

@@ -1,8 +1,10 @@
 """SOG and SPZ keep as much of splats as these formats have room for."""
 
+import errno
 import gzip
 import io
 import json
+import shutil
 import struct
 import zipfile
 
@@ -133,6 +135,44 @@ def test_a_table_that_does_not_say_how_many_entries_it_has_is_told_of(tmp_path, 
     assert len(zipfile.ZipFile(copy).namelist() if packed else list((tmp_path / "copy").iterdir())) == 8
     model = load_model(source)
     assert model.source == source and tool_request(tool)[1] not in (str(source), str(copy))
+
+
+@pytest.mark.parametrize("further", [(), ("other/meta.json",)])
+def test_a_folder_that_was_packed_as_such_is_read(tmp_path, further):
+    """As the menus of file managers do; splat-transform looks for meta.json at the top. Which one of several is meant nobody knows."""
+    write_sog(tmp_path / "whole.sog", columns_of(40, 1), antialiased=False)
+    with zipfile.ZipFile(tmp_path / "whole.sog") as archive, zipfile.ZipFile(tmp_path / "a.zip", "w") as out:
+        whole = {name: archive.read(name) for name in archive.namelist()}
+        for name in ("scene/", "__MACOSX/scene/._meta.json", *further):
+            out.writestr(name, b"")
+        for name, content in whole.items():
+            out.writestr(f"scene/{name}", content)
+    (tmp_path / "copy").mkdir()
+    copy = completed(tmp_path / "a.zip", tmp_path / "copy")
+    if further:
+        assert copy == tmp_path / "a.zip"
+    else:
+        with zipfile.ZipFile(copy) as archive:
+            read = {name: archive.read(name) for name in archive.namelist()}
+        assert {name: read[name] for name in whole if name != "meta.json"} == {name: whole[name] for name in whole if name != "meta.json"}
+        assert json.loads(read["meta.json"]) == json.loads(whole["meta.json"]) and read.keys() == whole.keys()
+
+
+def test_a_full_disk_is_not_taken_for_damage(tmp_path, monkeypatch):
+    """The file was read without its copy then, and lost its view-dependent colors without a word."""
+    write_sog(tmp_path / "whole.sog", columns_of(40, 1), antialiased=False)
+    with zipfile.ZipFile(tmp_path / "whole.sog") as archive:
+        archive.extractall(tmp_path)
+    (tmp_path / "meta.json").write_text((tmp_path / "meta.json").read_text().replace('"count": 40, "bands"', '"bands"'))
+    (tmp_path / "copy").mkdir()
+    assert completed(tmp_path / "meta.json", tmp_path / "copy") == tmp_path / "copy/meta.json"
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(shutil, "copyfile", full)
+    with pytest.raises(OSError, match="No space left"):
+        completed(tmp_path / "meta.json", tmp_path / "copy")
 
 
 def test_numbers_that_have_room_in_a_code_book_are_exact():

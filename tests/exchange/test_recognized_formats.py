@@ -15,6 +15,7 @@ from ply_files import write, write_splats
 
 from mipmap_plugin.errors import CheckpointError, OutputError
 from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.formats.splat_transform import reason_in
 from mipmap_plugin.models import detect, load_model
 from mipmap_plugin.models.adapted_name import adapted_name
 
@@ -45,9 +46,27 @@ def test_a_file_is_read_under_the_ending_that_the_tool_knows(tmp_path, tool, end
     assert (source == str(path)) == named and not Path(target).exists() and "--quiet" in options
 
 
+def test_of_an_error_without_a_text_its_type_is_told_and_not_how_long_it_took():
+    trace = "\n    at Gunzip.onerror (node:internal/streams:149:14)\n✗ failed in 0.211s  [peak cpu=88.9MB]\n"
+    assert reason_in("  ✗ TypeError" + trace) == "TypeError" and reason_in("✗ RangeError: too long" + trace) == "too long"
+    assert reason_in("✗ failed in 0.2s") == "✗ failed in 0.2s" and reason_in("") == ""
+
+
 def test_what_the_tool_refuses_is_one_sentence(tmp_path, tool):
     (tmp_path / "a.spz").write_bytes(b"NGSP" + bytes(9))
     assert "splat-transform does not read it (Invalid header)" in sentence(tmp_path / "a.spz")
+
+
+@pytest.mark.parametrize("answer", ["ply\nformat ascii 1.0\nelement vertex null\nend_header\n", None])
+def test_what_is_wrong_with_what_the_tool_made_of_a_file_is_said_of_the_file(tmp_path, tool, answer):
+    """And not of a temporary PLY, which nobody knows."""
+    if answer:
+        (tool / "answer.ply").write_text(answer)
+    else:
+        columns = read_ply(tool / "answer.ply").columns
+        write(tool / "answer.ply", columns | {"x": np.full_like(columns["x"], np.nan)})
+    (tmp_path / "a.spz").write_bytes(SPZ)
+    assert sentence(tmp_path / "a.spz").startswith(f"{tmp_path / 'a.spz'}, as splat-transform reads it: ")
 
 
 def test_compressed_ply_is_recognized_by_its_columns(tmp_path, tool):
@@ -64,6 +83,13 @@ def test_a_plain_ply_with_the_name_of_a_compressed_one_stays_plain(tmp_path):
     assert adapted_name(packed, 1 / 4) == "b_x0.25.compressed.ply"
 
 
+@pytest.mark.parametrize(("name", "adapted"), [("phone.bin", "phone_x0.25.ply"), ("phone", "phone_x0.25.ply"), ("phone.SPZ", "phone_x0.25.SPZ")])
+def test_the_adaptation_of_a_file_with_another_ending_is_a_ply(tmp_path, name, adapted):
+    """It was a folder whose name had the ending in its middle."""
+    (tmp_path / name).write_bytes(SPZ)
+    assert adapted_name(tmp_path / name, 1 / 4).lower() == adapted.lower()
+
+
 def test_a_sog_whose_checksums_are_wrong_is_refused(tmp_path, tool):
     with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
         archive.writestr("meta.json", json.dumps({"version": 2, "means": {"files": ["means_l.webp"]}}))
@@ -71,6 +97,30 @@ def test_a_sog_whose_checksums_are_wrong_is_refused(tmp_path, tool):
     (tmp_path / "a.sog").write_bytes((tmp_path / "a.sog").read_bytes().replace(b"abcd", b"abce"))
     with pytest.raises(CheckpointError, match=r"is damaged \(the checksum of means_l.webp is wrong\)"):
         load_model(tmp_path / "a.sog")
+
+
+@pytest.mark.parametrize(
+    ("content", "why"), [(gzip.compress(SPZ)[:-12], "it is cut off"), (gzip.compress(SPZ) + b"ab", "other bytes follow its end")]
+)
+def test_what_is_wrong_with_a_gzipped_spz_is_said(tmp_path, tool, content, why):
+    """splat-transform told its time and memory, in place of a reason."""
+    (tmp_path / "a.spz").write_bytes(content)
+    assert sentence(tmp_path / "a.spz") == f"{tmp_path / 'a.spz'} is damaged ({why}); download or export it again"
+    (tmp_path / "a.spz").write_bytes(gzip.compress(SPZ) + gzip.compress(b""))
+    assert len(load_model(tmp_path / "a.spz")) == 60
+
+
+@pytest.mark.parametrize("packed", ["spz", "sog"])
+def test_a_bomb_is_not_unpacked(tmp_path, tool, packed):
+    path, content = tmp_path / f"a.{packed}", json.dumps({"version": 2, "means": {"files": ["means_l.webp"]}})
+    if packed == "spz":
+        path.write_bytes(gzip.compress(SPZ + bytes(1 << 20)))
+    else:
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("meta.json", content)
+            archive.writestr("means_l.webp", bytes(1 << 20))
+    assert "is damaged (it would be more than 100 times as large unpacked" in sentence(path)
+    assert not (tool / "asked.json").exists()
 
 
 @pytest.mark.parametrize("where", ["a.sog", "room", "room/meta.json"])

@@ -76,6 +76,15 @@ def test_no_format_is_written_for_a_viewer_that_does_not_read_it(tmp_path, tool,
     base.refuse_output(tmp_path / "a.sog", overwrite=False, viewer="gdgs")
 
 
+@pytest.mark.parametrize("name", ["a.sog", "a.spz", "a.glb", "a.compressed.ply"])
+def test_no_file_by_itself_is_written_for_cesium_but_a_ply(tmp_path, name):
+    """It opens 3D Tiles only, and was said to show a SOG."""
+    with pytest.raises(SettingsError, match=r"Cesium opens splats in 3D Tiles only, which levels --tiles writes$"):
+        refuse_unread(tmp_path / name, ["cesium"])
+    with pytest.warns(UserWarning, match=r"a.ply: Cesium opens splats in 3D Tiles only, which levels --tiles writes$"):
+        refuse_unread(tmp_path / "a.ply", ["cesium"])
+
+
 @pytest.mark.parametrize("ending", [".spz", ".compressed.ply", ".ply"])
 @pytest.mark.parametrize("viewer", [None, "antialiased"])
 def test_splats_that_not_all_viewers_of_a_format_draw_as_trained_are_told_of(tmp_path, tool, ending, viewer, capsys):
@@ -100,6 +109,22 @@ def test_columns_that_a_format_has_no_place_for_are_told_of_and_in_the_report(tm
     assert told in json.loads((tmp_path / f"c{ending}.adaptation.json").read_text())["notes"]
     assert main(["adapt", str(tmp_path / "b.ply"), "--scale", "1", "--output", str(tmp_path / "d.ply")]) == 0
     assert json.loads((tmp_path / "d.ply.adaptation.json").read_text())["notes"] == []
+
+
+@pytest.mark.parametrize("ending", [".spz", ".compressed.ply", ".ply"])
+def test_what_spz_cuts_off_is_told_of_and_in_the_report(tmp_path, tool, ending, capsys):
+    """Its limits were in the documentation only. A thin splat's shorter axes do not count."""
+    columns = dict(read_ply(tiny.ply(tmp_path / "a.ply")).columns)
+    columns["scale_0"][0], columns["f_dc_1"][1:3], columns["f_rest_4"][3], columns["scale_2"][4] = 6.5, -3.5, 1.5, -20
+    for axis in range(3):
+        columns[f"scale_{axis}"][5:9] = -10.5
+    write(tmp_path / "b.ply", columns)
+    made = tmp_path / f"c{ending}"
+    assert main(["adapt", str(tmp_path / "b.ply"), "--scale", "1", "--output", str(made)]) == 0
+    lost = "1 longer than 379 units, 4 shorter than 4.5e-05 units, 2 with a color of degree 0 outside -0.44 to 1.44, 1 with other harmonics"
+    told = f"SPZ cuts off, of 60 splats, {lost} outside -1 to 1; a .ply keeps them"
+    count, notes = int(ending == ".spz"), json.loads(made.with_name(made.name + ".adaptation.json").read_text())["notes"]
+    assert capsys.readouterr().err.count(told) == count and notes.count(told) == count
 
 
 @pytest.mark.parametrize("ending", [".spz", ".compressed.ply", ".ply"])
@@ -155,10 +180,9 @@ def moved_by(offset):
     return VanillaModel.from_gaussians(replace(splats, means=splats.means + splats.means.new_tensor([0.0, 0.0, offset])))
 
 
-def test_spz_is_not_written_of_splats_that_are_too_far_away_for_it(tmp_path, tool):
-    """They would leave fewer bits for fractions than the 12 that other writers have, for all positions."""
-    far = moved_by(-2060.0)
-    refused = r"60 of 60 splats lie 2,048 or more units from the origin .* 1/4096 unit; remove them, .*shrink the scene, or give a .sog or a .ply"
+@pytest.mark.parametrize(("offset", "why"), [(-5e5, r"500,00\d .* 0.0625 unit, more than half the size of 45 of 60"), (9e6, "9,000,00.* no room")])
+def test_spz_is_not_written_of_splats_that_are_too_far_away_for_it(tmp_path, tool, offset, why):
+    far, refused = moved_by(offset), f"{why}.*; remove what lies far away, move or shrink the scene, or give a .sog or a .ply"
     with pytest.raises(SettingsError, match=refused):
         far.save(tmp_path / "out.spz", provenance={})
     with pytest.raises(SettingsError, match=refused):  # before any work
@@ -168,7 +192,13 @@ def test_spz_is_not_written_of_splats_that_are_too_far_away_for_it(tmp_path, too
         write_tile(tmp_path / "out.ply", tmp_path / "out.glb")
     assert not (tmp_path / "out.glb").exists()
     far.save(tmp_path / "out.compressed.ply", provenance={})
-    moved_by(2000.0).save(tmp_path / "out.spz", provenance={})
+
+
+def test_a_splat_far_away_takes_no_spz_from_a_scene_whose_splats_are_larger_than_its_steps(tmp_path, tool):
+    """Other writers keep 12 bits of fractions, so that nothing was written of splats 2,048 units away or more; the format has room for fewer."""
+    model = VanillaModel.from_gaussians(tiny.gaussians())
+    model.parameters()["means"].data[0] = 5000.0
+    assert model.save(tmp_path / "out.spz", provenance={}).is_file()
 
 
 @pytest.mark.parametrize("name", ["a.sog", "a.spz", "a.glb", "a.compressed.ply"])
@@ -183,7 +213,7 @@ def test_levels_in_tiles_are_refused_of_such_splats_before_any_work(tmp_path, to
     monkeypatch.setattr("mipmap_plugin.levels.ladder.make_levels", None)
     moved_by(5e5).save(tmp_path / "city.ply", provenance={})
     assert main(["levels", str(tmp_path / "city.ply"), "--viewer", "cesium", "--output", str(tmp_path / "ladder"), "--tiles"]) == 2
-    assert "60 of 60 splats lie 2,048 or more units" in (told := capsys.readouterr().err) and "leave --tiles out" in told
+    assert "more than half the size of 45 of 60 splats" in (told := capsys.readouterr().err) and "leave --tiles out" in told
 
 
 def test_a_splat_transform_that_is_too_old_for_sog_is_found_before_the_work(tmp_path, tool):

@@ -114,6 +114,38 @@ def test_a_frames_own_lens_wins(tmp_path):
     assert (first.time, second.time) == (None, 0.25)
 
 
+@pytest.mark.parametrize(("own", "focal"), [({"k1": 0.5}, (100.0, 50.0)), ({"w": 64}, (50.0, 50.0)), ({"fl_x": 100.0}, (100.0, 50.0))])
+def test_in_a_file_of_nerfstudio_the_files_lens_wins(tmp_path, own, focal):
+    """nerfstudio_dataparser.py asks a frame only for what the file lacks; a frame of another size does not fit the file's lens."""
+    data = {"camera_model": "OPENCV", "k1": 0.0, "fl_x": 100.0, "w": 32, "h": 32, "frames": [frame(**{"fl_x": 50.0, "fl_y": 50.0, **own})]}
+    scene = read_transforms(write_json(tmp_path / "transforms.json", data))
+    told = "transforms.json: the intrinsics of 1 of its frames are passed over for those of the file, as in nerfstudio"
+    assert (scene.cameras[0].fx, scene.cameras[0].fy) == focal and not scene.lenses
+    assert (told in scene.notes) == (own == {"k1": 0.5})
+
+
+def test_distortion_may_be_a_list(tmp_path):
+    """Its numbers were passed over without a word."""
+    data = {"distortion_params": [0.1, 0, 0, 0, 0, 0], "k1": 0.3, "fl_x": 9.0, "frames": [frame()]}
+    save_image(tmp_path / "train/r_0.png")
+    [lens] = read_transforms(write_json(tmp_path / "transforms.json", data)).lenses.values()
+    assert lens.params[4:] == (0.1, 0, 0, 0)
+
+
+def test_what_is_null_is_not_stated(tmp_path):
+    frames = [frame() | {"fl_y": None, "cx": None, "w": None, "h": None, "k1": None, "time": None}]
+    data = {"fl_x": 9.0, "fl_y": None, "cy": None, "w": 8, "h": 6, "frames": frames}
+    [camera] = read_transforms(write_json(tmp_path / "transforms.json", data)).cameras
+    assert (camera.fy, camera.cx, camera.cy, camera.size, camera.time) == (9.0, 4.0, 3.0, (6, 8), None)
+
+
+def test_test_frames_of_scannetpp_are_test_views(tmp_path):
+    """They were left out."""
+    data = {"fl_x": 9.0, "w": 8, "h": 6, "frames": [frame(), frame(file_path="b")], "test_frames": [frame(file_path="c")]}
+    cameras = read_transforms(write_json(tmp_path / "transforms.json", data)).cameras
+    assert [(camera.name, camera.split) for camera in cameras] == [("r_0", "train"), ("b", "train"), ("c", "test")]
+
+
 def test_test_and_train_files_are_the_splits(tmp_path):
     for split, names in (("train", "abc"), ("test", "de"), ("val", "f")):
         frames = [frame(file_path=name) for name in names]
@@ -132,6 +164,7 @@ def test_without_a_test_file_val_is_the_test_split(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"cx": 0.5}, r"frame 0 \(r_0\), cx: is 0.5, but must be in pixels"),
         ({"k1": "x"}, r"frame 0 \(r_0\), k1: is not made of numbers"),
         ({"camera_model": "EQUIRECTANGULAR"}, r"has a lens that is not perspective \(EQUIRECTANGULAR\)"),
         ({"camera_model": "EQUIRECTANGULAR", "fl_x": None}, r"has a lens that is not perspective \(EQUIRECTANGULAR\)"),
@@ -150,8 +183,9 @@ def test_a_broken_frame_is_named(tmp_path, changes, message):
         read_transforms(path)
 
 
-def test_zero_distortion_is_no_distortion(tmp_path):
-    data = {"fl_x": 9.0, "w": 8, "h": 8, "k1": 0.0, "camera_model": "OPENCV", "frames": [frame()]}
+@pytest.mark.parametrize("model", ["OPENCV", "PERSPECTIVE", "pinhole", None])
+def test_zero_distortion_is_no_distortion(tmp_path, model):
+    data = {"fl_x": 9.0, "w": 8, "h": 8, "k1": 0.0, "camera_model": model, "frames": [frame()]}
     assert len(read_transforms(write_json(tmp_path / "transforms.json", data)).cameras) == 1
 
 

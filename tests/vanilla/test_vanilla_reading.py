@@ -120,6 +120,17 @@ def test_trained_scale_from_cfg_args(tmp_path):
     assert load_vanilla(write_splats(tmp_path / "alone.ply")).trained == TrainedScale()
 
 
+@pytest.mark.parametrize("text", [b"\xef\xbb\xbfNamespace(%s)", b"Namespace(%s, source_path='C:\\\\J\xfcrgen')"], ids=["a mark", "another encoding"])
+def test_cfg_args_of_windows_are_read_and_copied_byte_by_byte(tmp_path, text):
+    """A letter in a path, or an editor's mark, took away the background and the test views, too."""
+    folder, text = write_model_folder(tmp_path / "m"), text % b"sh_degree=3, white_background=True, resolution=2"
+    (folder / "cfg_args").write_bytes(text)
+    model = load_vanilla(folder)
+    assert model.trained == TrainedScale(resolution=2, background=(1.0, 1.0, 1.0))
+    model.save(tmp_path / "out", provenance={})
+    assert (tmp_path / "out/cfg_args").read_bytes() == text
+
+
 def test_a_model_with_hostile_cfg_args_loads_without_them(tmp_path):
     folder = write_model_folder(tmp_path / "m", cfg_args="print('no')")
     model = load_vanilla(folder)

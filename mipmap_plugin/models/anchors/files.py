@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mipmap_plugin.errors import CheckpointError, OutputExists, SettingsError
 from mipmap_plugin.formats.atomic import new_file, sha256
-from mipmap_plugin.formats.cfg_args import format_cfg_args
+from mipmap_plugin.formats.cfg_args import cfg_args_text, format_cfg_args
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.models.anchors.networks import Weights, check_networks, read_networks
 from mipmap_plugin.models.base import CARRIED, TrainedScale
@@ -148,7 +148,7 @@ def cfg_text(source: Path | None, target: Path, trained: TrainedScale, options: 
     Whether views were held out (`eval`) is None then: not known.
     """
     if source is not None and (source / "cfg_args").is_file():
-        return (source / "cfg_args").read_bytes().decode("utf-8")
+        return cfg_args_text(source / "cfg_args")
     usual = {"source_path": "", "model_path": str(target), "images": "images", "resolution": trained.resolution, "data_device": "cuda", "eval": None}
     sampling = {"ds": 1, "ratio": 1, "undistorted": False, "white_background": trained.background == (1.0, 1.0, 1.0)}
     return format_cfg_args({**usual, **sampling, **options})
