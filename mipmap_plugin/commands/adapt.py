@@ -77,7 +77,7 @@ def adapt(
 
     Args:
         checkpoints: A PLY or a model folder, or several; patterns such as 'output/*' too.
-        scale: Target focal length over base focal length, such as 1/4 or 4; may be given several times. Required without splats or bytes.
+        scale: Target focal length over base focal length, such as 1/4 or 4; may be given several times. Required without --splats or --bytes.
         output: Where to write; by default beside the checkpoint, as NAME_x0.25. With several scales or viewers: a folder for all files.
         recipe: default; thorough (more steps and views); instant (closed form only, seconds); paper (the published method); or a registered one.
         viewer: Viewer to make the file for: classic, spark, ...; portable: all; several: a file each. By default what draws as the training did.
