@@ -30,7 +30,7 @@ def main() -> None:
             (Path(folder) / shown).write_bytes((DEMO / name).read_bytes())
         for name, words in (("demo", ["demo"]), ("inspect", ["inspect", "bicycle.ply"])):
             done = subprocess.run(["mipmap-plugin", *words], cwd=folder, capture_output=True, text=True, check=True)
-            draw(DOCS / f"{name}.svg", "mipmap-plugin " + " ".join(words), done.stdout.replace(str(Path(folder).resolve()), "/home/you"))
+            draw(DOCS / f"{name}.svg", "mipmap-plugin " + " ".join(words), done.stdout)
 
 
 def draw(picture: Path, command: str, printed: str) -> None:

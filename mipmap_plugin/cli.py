@@ -32,7 +32,7 @@ from mipmap_plugin.process.signals import ends_as_by_ctrl_c
 
 DESCRIPTION = (
     "Make a Gaussian-splatting checkpoint look right at another zoom. With every command go --quiet, to print errors, warnings and JSON only, "
-    "and --log FILE, to append all that is said, with further details, to a file."
+    "and --log FILE, to append all that is said, with further details, to a file. mipmap-plugin --version tells the version."
 )
 
 COMMANDS = {command.__name__.rstrip("_"): command for command in (inspect, adapt, levels, render, view, evaluate, tradeoff, backends, list_, demo)}

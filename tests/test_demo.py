@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.resources import files
+from pathlib import Path
 
 import pytest
 
@@ -54,3 +55,9 @@ def test_the_story_says_what_changed_at_each_zoom_and_where_it_is(tmp_path):
     assert "x4" in lines[2] and "needles and holes" in lines[2]
     assert "41 s" in lines[3] and str(tmp_path) in lines[3]
     assert lines[4] == f"page: {tmp_path / 'report.html'}"
+
+
+def test_the_story_tells_paths_from_here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    lines = story([], None, 1.0, Path("demo"), tmp_path / "demo/report.html").splitlines()
+    assert lines[1].endswith("(base | adapted | truth): demo") and lines[2] == "page: demo/report.html"

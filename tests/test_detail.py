@@ -176,6 +176,13 @@ def test_a_network_that_is_not_used_is_told(upsampler, scale, settings, reason):
         model.adapt(scale, upsampler="mine", **settings)
 
 
+def test_an_interpolation_that_is_not_used_is_told():
+    """Of lanczos, which --upsampler takes and `list` lists, nothing was said where it changed nothing."""
+    model = wrap_model(tiny.model(), cameras=tiny.cameras(6))
+    with pytest.warns(UserWarning, match="the upsampler lanczos is not used, because compare_at is base; recipe paper uses it"):
+        model.adapt(2, upsampler="lanczos", steps=2)
+
+
 def test_no_more_views_are_enlarged_than_the_steps_use(upsampler):
     enlarged = []
     upsampler(lambda image, size: enlarged.append(size) or resize(image, size, "lanczos"))

@@ -122,6 +122,20 @@ def test_a_file_for_several_viewers_is_told_of_by_the_worst_of_them(model_folder
     assert [picture.name for picture in page.zooms[0].pictures[:3]] == ["base in classic", "base in spark", "instant in spark"]
 
 
+def test_the_page_of_the_demo_does_not_say_that_adapted_is_adapted(monkeypatch):
+    pytest.importorskip("numba")
+    monkeypatch.setattr("mipmap_plugin.pages.in_viewers.VIEWERS", ("classic",))
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(3), backend="cpu")
+    camera, gallery = base.cameras[0], Gallery(base, "the ray-traced world")
+    truth = base.render(camera).image
+    for name in ("base", "adapted"):
+        if name == "adapted":
+            gallery.adapted(name, base.adapt(1 / 2, recipe="instant"))
+        gallery.shot(Shot(name, "ball", 1 / 2, camera, truth, truth, 20.0, None, None))
+    [zoom] = gallery.zooms([Row(name, 1 / 2, "P3", 20.0, None, 3.0, 1.0, 9, scene="ball") for name in ("base", "adapted")])
+    assert zoom.viewers and zoom.in_viewers == ""
+
+
 def test_the_page_tells_of_the_default_recipe_by_name_in_whatever_order_recipes_were_asked_for(monkeypatch):
     pytest.importorskip("numba")
     monkeypatch.setattr("mipmap_plugin.pages.in_viewers.VIEWERS", ("classic",))

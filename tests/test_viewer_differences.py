@@ -39,6 +39,12 @@ def test_what_was_trained_with_compensation_looks_wrong_in_a_classic_viewer(tmp_
     assert "antialiased the same" in line and decibels(line)["classic"] < decibels(line)["spark"]
 
 
+def test_an_adapted_file_is_drawn_at_its_own_scale(tmp_path):
+    """At x1, where it never looks right, how viewers draw it is of no use."""
+    adapted = loaded(tmp_path).adapt(1 / 2, recipe="instant").save(tmp_path / "adapted.ply")
+    assert viewer_differences(wrap_model(adapted, cameras=tmp_path / "model/cameras.json")).endswith("at x0.5 in 3 views")
+
+
 def test_fewer_views_are_drawn_of_more_splats_and_none_of_too_many(tmp_path, monkeypatch):
     model = loaded(tmp_path)
     monkeypatch.setattr(module, "SPLATS", 119)

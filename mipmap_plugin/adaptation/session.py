@@ -31,7 +31,7 @@ from mipmap_plugin.adaptation.shown import refuse_blind, remarks, showing, too_u
 from mipmap_plugin.adaptation.start.candidates import UNMATCHED, StartSearch
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
 from mipmap_plugin.adaptation.start.problem import StartProblem
-from mipmap_plugin.adaptation.target.detail import DetailLoss, unused_network
+from mipmap_plugin.adaptation.target.detail import DetailLoss, unused_upsampler
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
@@ -113,7 +113,7 @@ class Session:
         if self._base_is_right:
             copy, reason = self._for_target(self.base), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
-        found = [too_unlike(self.base_views), too_far_out(self.base, self.base_views, self.targets), unused_network(self.config, wanted)]
+        found = [too_unlike(self.base_views), too_far_out(self.base, self.base_views, self.targets), unused_upsampler(self.config, wanted)]
         for remark in filter(None, [*remarks(self.base_views, self.base, near, orbit=self._orbits), *found, option_note(self.base, wanted)]):
             warn(remark)
         began = now(self.device) - self.seconds["total"]

@@ -19,6 +19,7 @@ from mipmap_plugin.commands.types import BackendName, Background, Cameras, Check
 from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.formats.here import from_here
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.recipes import recipe as make_config
@@ -76,7 +77,7 @@ def adapt(
 
     Args:
         checkpoints: A PLY or a model folder, or several; patterns such as 'output/*' too.
-        scale: Target focal length over base focal length, such as 1/4 or 4; may be given several times. Required without splats or bytes.
+        scale: Target focal length over base focal length, such as 1/4 or 4; may be given several times. Required without --splats or --bytes.
         output: Where to write; by default beside the checkpoint, as NAME_x0.25. With several scales or viewers: a folder for all files.
         recipe: default; thorough (more steps and views); instant (closed form only, seconds); paper (the published method); or a registered one.
         viewer: Viewer to make the file for: classic, spark, ...; portable: all; several: a file each. By default what draws as the training did.
@@ -177,7 +178,7 @@ def _saved(adapted: Adapted, target: Path, overwrite: bool, *, quiet: bool) -> d
     saved = adapted.save(target, overwrite=overwrite)
     if not quiet:
         _say(saved, adapted.report_of(saved), adapted.model)
-    return {"file": str(saved), **adapted.report_of(saved).model_dump()}
+    return {"file": str(saved.absolute()), **adapted.report_of(saved).model_dump()}
 
 
 def _requests(scales: Sequence[float], viewers: tuple[str, ...]) -> list[tuple[float, str | None]]:
@@ -244,7 +245,7 @@ def _say(saved: Path, report: Report, model: SplatModel) -> None:
     """Two lines, what and where; the rest goes to the log."""
     splats = f"{report.gaussians_before:,} -> {report.gaussians_after:,} splats, {report.seconds['total']:.1f} s"
     say(f"x{report.scale:g}{f' in {report.viewer}' if report.viewer else ''}: {report.gain()}, {splats}")
-    say(f"{saved}, {_made_for(report, model, saved)}")
+    say(f"{from_here(saved)}, {_made_for(report, model, saved)}")
     for line in _details(report):
         detail(f"  {line}")
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.voice import put, say
 from mipmap_plugin.formats.atomic import json_text
+from mipmap_plugin.formats.here import from_here
 from mipmap_plugin.process.garbage import leave_loaded, uncollected
 from mipmap_plugin.progress import announced
 
@@ -49,7 +50,7 @@ def base_cameras(wrapped: Wrapped, given: Path | None) -> str:
 
     place = wrapped.cameras_from.get("scene", "")
     own = [told(path.absolute()) for path in (wrapped.model.folder, wrapped.model.source) if path is not None]
-    return "" if given is not None or place in own else place
+    return "" if given is not None or not place or place in own else from_here(Path(place))
 
 
 def scene(base: Base, path: Path) -> Scene:
@@ -76,5 +77,5 @@ def print_facts(facts: dict[str, Any]) -> None:
         lines = value if isinstance(value, list) else [value]
         hanging = None if name == "file" else KEY + 2 * (len(lines) > 1)  # a path is not wrapped, to be copied
         for line in lines:
-            say(f"{name + ':' if name else '':{KEY}}{line}", hanging)
+            say(f"{name + ':' if name else '':{KEY}}{f'{line:,}' if isinstance(line, int) else line}", hanging)
             name = ""

@@ -70,7 +70,7 @@ def evaluate(
         appearance: Appearance of test views, if training views have their own: mean of these, or upstream (of the view with the same number).
         cameras: For each checkpoint that has none: a cameras.json or a scene, such as the images' if it was trained on these at their size.
         output: Also write the rows, and notes on missing ones, as JSON to this file.
-        report: Write a page that shows it all: beside `output`, or else NAME.evaluation.html in this folder, numbered if there is one already.
+        report: Write a page that shows it all: beside --output, or else NAME.evaluation.html in this folder, numbered if there is one already.
         overwrite: Replace files that exist.
         json: Print JSON instead of a table.
     """

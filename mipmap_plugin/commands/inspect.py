@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import base_cameras, print_facts, print_json
 from mipmap_plugin.commands.types import Cameras, Checkpoint, ScreenFilter, Up
+from mipmap_plugin.jobs.base import COLORS
 from mipmap_plugin.process.garbage import uncollected
 from mipmap_plugin.progress import announced
 
@@ -80,11 +81,16 @@ def _facts(checkpoint: Path, wrapped: Wrapped, given: Path | None, *, whole: boo
         "verdict": _verdict(wrapped, _advice(wrapped, checkpoint, given), told, bool(lost) or health.spoilt(), health.mostly_unseen()),
         "splats": len(gaussians),
         "sh degree": f"{gaussians.used_sh_degree()} in use of {gaussians.sh_degree}",
-        "trained with": f"{wrapped.trained.told()}, background {wrapped.background}",
+        "trained with": f"{wrapped.trained.told()}, background {_color(wrapped.background)}",
         "cameras": _seen_by(wrapped, given),
         "effects": [str(effect) for effect in effects if effect.on or whole] + _off(effects, shown=whole),
         "health": told or ["nothing found"],
     }
+
+
+def _color(background: tuple[float, ...]) -> str:
+    """A background in the words of --background, or by its numbers."""
+    return next((name for name, color in COLORS.items() if name and color == background), str(background))
 
 
 def _seen_by(wrapped: Wrapped, given: Path | None) -> str:

@@ -13,6 +13,7 @@ from mipmap_plugin.commands.common import print_json
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import JobsFailed, SettingsError, install
+from mipmap_plugin.formats.here import from_here
 from mipmap_plugin.formats.staging import missing_folders, remove_empty
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job, Outcome
@@ -118,7 +119,7 @@ def finished_before(jobs: Iterable[Job], json: bool, *, may_load: bool = True) -
 
     found = {job.target: before for job in jobs if (before := finished(job, may_load=may_load))}
     for file, _ in found.values() if not json else ():
-        say(f"{file}: finished before")
+        say(f"{from_here(file)}: finished before")
     return {target: {"file": str(file), **report} for target, (file, report) in found.items()}
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import this_command
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
+from mipmap_plugin.formats.here import from_here
 
 if TYPE_CHECKING:
     from mipmap_plugin.adaptation.adapted import Adapted
@@ -25,7 +26,7 @@ PAGE = "report.html"
 
 def look_at(page: Path) -> str:
     """The line that says where a page is."""
-    return f"page: {page}"
+    return f"page: {from_here(page)}"
 
 
 def evaluation_page_path(checkpoint: Path, output: Path | None) -> Path:

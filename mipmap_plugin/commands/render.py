@@ -85,6 +85,8 @@ def render(
         _write(picture, wrapped.render(camera.zoomed(zoom), zoom, filter_name, supersampling, **options), outputs, overwrite)
     count = f"{len(views)} picture{'s' if len(views) > 1 else ''}"
     say(f"{count} in {output}{_told_by_file(zoom if scale is None else 1.0, own_viewer)}")
+    if not wrapped.cameras:
+        say(f"seen from a generated orbit, {wrapped.viewpoints.orbit.told()}; --cameras gives the scene's own cameras")
     if place := base_cameras(wrapped, cameras):
         say(f"seen by the cameras of its base, in {place}; --cameras gives others")
 

@@ -67,7 +67,7 @@ def tradeoff(
         views: Maximum number of views to evaluate on.
         threads: Maximum number of processor threads; by default as many as torch finds.
         seed: Seed of the first repeat.
-        picture: Draw tradeoff.png, which needs the extra `plot`.
+        picture: Draw tradeoff.png, which needs the extra plot.
         report: Also write report.html, a page whose fronts tell each point under the pointer.
         overwrite: Replace results that exist.
         json: Print JSON instead of tables.

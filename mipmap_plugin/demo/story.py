@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mipmap_plugin.evaluation.evaluate import Row
+from mipmap_plugin.formats.here import from_here
 
 # What is wrong with a base at other zooms (Mip-Splatting, section 1).
 ZOOMED_OUT, ZOOMED_IN = "thick and bright", "needles and holes"
@@ -22,8 +23,8 @@ def story(rows: Sequence[Row], viewer: str | None, seconds: float, output: Path,
         fault = f" ({ZOOMED_OUT if scale < 1 else ZOOMED_IN})" if scale != 1 else ""
         change = f"base {base.psnr_db:.1f} dB{fault} -> adapted {adapted.psnr_db:.1f} dB"
         lines.append(f"  {_zoom(scale):5}{change}, {base.gaussians:,} -> {adapted.gaussians:,} splats, in {adapted.adapt_seconds:.0f} s")
-    lines.append(f"All of it took {seconds:.0f} s. Files and pictures (base | adapted | truth): {output.resolve()}")
-    return "\n".join([*lines, *([f"page: {page}"] if page else [])])
+    lines.append(f"All of it took {seconds:.0f} s. Files and pictures (base | adapted | truth): {from_here(output)}")
+    return "\n".join([*lines, *([f"page: {from_here(page)}"] if page else [])])
 
 
 def _zoom(scale: float) -> str:

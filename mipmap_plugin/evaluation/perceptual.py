@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Literal
@@ -13,6 +15,7 @@ from torch import Tensor, nn
 from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError, install
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.process.torchvision_absent import torchvision_optional
+from mipmap_plugin.progress import announced
 
 # A backbone and its input: images in -1..1, as LPIPS is defined, or (01) in 0..1, as papers of this field use VGG.
 Kind = Literal["alex", "vgg", "vgg-01"]
@@ -75,7 +78,9 @@ def _load(backbone: str, file: Path | None) -> nn.Module:
 
 def _download(backbone: str) -> dict[str, Tensor]:
     try:
-        return torch.hub.load_state_dict_from_url(DOWNLOADS[backbone], map_location="cpu", weights_only=True, check_hash=True)
+        # What torch prints of a download is kept from the standard output, which may be JSON.
+        with announced(f"downloading the weights of {backbone}"), redirect_stdout(StringIO()):
+            return torch.hub.load_state_dict_from_url(DOWNLOADS[backbone], map_location="cpu", progress=False, weights_only=True, check_hash=True)
     except OSError as error:
         advice = f"download {DOWNLOADS[backbone]} elsewhere and give the file (--lpips-weights)"
         raise SettingsError(f"LPIPS needs the weights of its backbone, which cannot be downloaded ({error}); {advice}") from error

@@ -8,6 +8,7 @@ import torch
 
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.evaluation.metrics import SAME_DB, psnr
+from mipmap_plugin.models.adapted_scale import adapted_scale
 from mipmap_plugin.models.base import why_no_viewer
 from mipmap_plugin.wrap import Wrapped
 
@@ -20,11 +21,12 @@ SPLATS, PIXELS = 500_000, 4_000_000
 
 @torch.no_grad()
 def viewer_differences(wrapped: Wrapped) -> str:
-    """Describe the mean PSNR in each viewer over a few views of the base scale in one sentence, or why it was not measured.
+    """Describe the mean PSNR in each viewer over a few views, at the scale that a file was adapted to, in one sentence, or why it was not measured.
 
     Both images are rendered by this package: the viewer's with its convention (`splatting.viewers`), the truth with that of the training.
     """
-    model, views = wrapped.model, wrapped.views()
+    model, scale = wrapped.model, adapted_scale(wrapped.model.source) or 1.0
+    views = [view.zoomed(scale) for view in wrapped.views()]
     count, pixels = len(model.gaussians(views[0])), views[0].width * views[0].height
     if reason := why_no_viewer(model):
         return f"not drawn: {reason}"
@@ -36,9 +38,9 @@ def viewer_differences(wrapped: Wrapped) -> str:
     if view_count == 0:
         return f"not drawn: {count:,} splats on {pixels:,} pixels take too long; `mipmap-plugin render --viewer NAME` draws them"
     chosen = evenly(views, view_count)
-    truths = [wrapped.render(view).image for view in chosen]
+    truths = [wrapped.render(view, scale).image for view in chosen]
     parts = []
     for viewer in VIEWERS:
-        mean_psnr = fmean(psnr(wrapped.render(view, viewer=viewer).image, truth) for view, truth in zip(chosen, truths, strict=True))
+        mean_psnr = fmean(psnr(wrapped.render(view, scale, viewer=viewer).image, truth) for view, truth in zip(chosen, truths, strict=True))
         parts.append(f"{viewer} {'the same' if mean_psnr == SAME_DB else f'{mean_psnr:.1f} dB'}")
-    return f"{', '.join(parts)}, compared with its training, at x1 in {view_count} view{'s' if view_count > 1 else ''}"
+    return f"{', '.join(parts)}, compared with its training, at x{scale:g} in {view_count} view{'s' if view_count > 1 else ''}"

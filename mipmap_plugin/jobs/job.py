@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.formats.here import from_here
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.recipes import recipe
 
@@ -38,7 +39,7 @@ class Job:
         return None
 
     def __str__(self) -> str:
-        return f"{self.base.checkpoint} x{self.scale:g}{f' in {self.viewer}' if self.viewer else ''}"
+        return f"{from_here(self.base.checkpoint)} x{self.scale:g}{f' in {self.viewer}' if self.viewer else ''}"
 
 
 @dataclass(frozen=True)

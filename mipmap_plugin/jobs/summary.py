@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
+from mipmap_plugin.formats.here import from_here
 from mipmap_plugin.jobs.job import Job, Outcome
 
 COLUMNS = ("checkpoint", "scale", "viewer", "outcome", "splats", "dB", "seconds", "file, or what is wrong")
@@ -29,7 +29,7 @@ def _row(outcome: Outcome) -> tuple[str, ...]:
     job, report = outcome.job, outcome.report
     splats = f"{report['gaussians_before']:,} -> {report['gaussians_after']:,}" if report else ""
     seconds = f"{outcome.seconds:.1f}"
-    return (_short(job.base.checkpoint), f"x{job.scale:g}", job.viewer or "", outcome.status, splats, _psnr(report), seconds, _last(outcome))
+    return (from_here(job.base.checkpoint), f"x{job.scale:g}", job.viewer or "", outcome.status, splats, _psnr(report), seconds, _last(outcome))
 
 
 def _psnr(report: dict[str, Any]) -> str:
@@ -44,12 +44,7 @@ def _psnr(report: dict[str, Any]) -> str:
 
 
 def _last(outcome: Outcome) -> str:
-    return _short(outcome.file) if outcome.file else outcome.reason
-
-
-def _short(path: Path) -> str:
-    """A path from the current directory, if it lies in it."""
-    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
+    return from_here(outcome.file) if outcome.file else outcome.reason
 
 
 def totals(outcomes: Sequence[Outcome], count: int) -> str:

@@ -82,8 +82,9 @@ class Gallery:
         if any(each == scale for _, each in self._adapted):
             reason = why_not(self._base) or "It was adapted before an interruption, after which viewers' pictures are not drawn again."
         row, viewers = self._viewers.get(scale, ("", ()))
+        told = "" if row == "adapted" else row  # of the demo, whose only file it is
         return Zoom(
-            label, scale, in_order(pictures), shots[0].camera.name, self._truth, "all judged views", viewers, "" if viewers else reason, row
+            label, scale, in_order(pictures), shots[0].camera.name, self._truth, "all judged views", viewers, "" if viewers else reason, told
         )  # fmt: skip
 
     def _role(self, shot: Shot, in_viewer: bool) -> Role:

@@ -67,6 +67,18 @@ def test_adapt_writes_beside_the_checkpoint_unless_told_otherwise(run, tmp_path)
     assert len(load_model(tmp_path / "base_x4.ply")) == 60
 
 
+def test_files_and_pages_are_told_by_their_paths_from_here(run):
+    """Files beside the checkpoint were told by their whole paths, and those of --output as they were given; the JSON has whole paths."""
+    tiny.folder(Path("base"))
+    words = ["adapt", "base", "--scale", "1/2", *NO_STEP]
+    _, beside, _ = run(*words, "--report")
+    assert beside.splitlines()[1].startswith("base_x0.5/point_cloud/") and beside.splitlines()[-1] == "page: base_x0.5.report.html"
+    _, out, err = run(*words, "--jobs", "1", "--output", "other.ply")
+    assert out.splitlines()[1].endswith(" other.ply") and err.startswith("base x0.5: done")
+    _, report, _ = run(*words, "--output", "third.ply", "--json")
+    assert json.loads(report)[0]["file"] == str(Path("third.ply").absolute())
+
+
 def test_adapt_hands_its_options_on(run, model_folder, tmp_path):
     options = ["--recipe", "paper", "--seed", "7", "--resize", "area", "--upsampler", "lanczos", "--background", "white", "--time-budget-s", "60"]
     code, out, _ = run("adapt", model_folder, "--scale", "1/2", "--output", tmp_path / "a.ply", "--json", *options, *QUICK)

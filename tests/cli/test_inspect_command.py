@@ -116,6 +116,11 @@ def test_inspect_says_how_far_viewers_are_from_training(run, model_folder):
     assert "viewers:      not requested" in run("inspect", model_folder, "--no-viewers")[1]
 
 
+def test_numbers_and_colors_are_told_in_words(run, tmp_path):
+    out = run("inspect", tiny.ply(tmp_path / "a.ply", count=1200), "--no-viewers")[1]
+    assert "splats:       1,200\n" in out and ", background black\n" in out
+
+
 def test_inspect_says_what_it_knows_before_it_draws(run, model_folder, monkeypatch, capsys):
     said = []
     monkeypatch.setattr(viewer_differences, "viewer_differences", lambda wrapped: said.append(capsys.readouterr().out) or "none")

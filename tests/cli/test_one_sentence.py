@@ -1,6 +1,7 @@
 """One sentence instead of a traceback for everything that is wrong, and the words of the command line."""
 
 import errno
+import inspect
 import re
 import subprocess
 import sys
@@ -25,6 +26,15 @@ def refused_once_named(answer, *words):
 
 def test_the_version(run):
     assert re.fullmatch(r"mipmap-plugin \d+\.\d+\.\d+\S*\n", run("--version")[1])
+    assert "mipmap-plugin --version tells" in " ".join(run("--help")[1].split())
+
+
+def test_help_names_options_as_they_are_typed():
+    """Neither by the names of Python's parameters nor between backticks."""
+    for command in COMMANDS.values():
+        told = re.sub(r"^ +\w+: ", "", inspect.getdoc(command), flags=re.MULTILINE)
+        names = re.findall(r"`\w+`|\b[a-z]+_[a-z]+\b", told)
+        assert [name for name in names if "`" in name or name in inspect.signature(command).parameters] == []
 
 
 @pytest.mark.parametrize("command", COMMANDS.values())

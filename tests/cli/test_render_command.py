@@ -66,6 +66,12 @@ def test_render_says_that_no_view_shows_anything(run, tmp_path):
     assert "none of the 2 views shows a splat: the cameras seem to be of another scene" in " ".join(err.split())
 
 
+@pytest.mark.usefixtures("small_orbits")
+def test_render_says_that_its_views_are_generated(run, tmp_path):
+    out = run("render", tiny.ply(tmp_path / "a.ply"), "--output", tmp_path / "out", "--up", "z")[1]
+    assert out.endswith("\nseen from a generated orbit, from above the horizon, with z up; --cameras gives the scene's own cameras\n")
+
+
 def test_render_says_that_a_viewer_draws_no_such_splats(run, tmp_path):
     folder, scene = moving.write_deformable(tmp_path / "moving"), write_cameras(tmp_path / "cameras.json", tiny.cameras(1))
     code, _, err = run("render", folder, "--output", tmp_path / "out", "--viewer", "spark", "--cameras", scene, "--backend", "reference")

@@ -44,7 +44,7 @@ def poses(cameras):
 def test_photographs_are_the_truth_where_there_are_any(tmp_path):
     model, scene = wrapped(), load_scene(tiny.scene(tmp_path / "scene", train=tiny.cameras(2), count=30))
     yardstick = photographs(model, scene, 1 / 4, most=1)
-    assert yardstick.label == "real dB, protocol P3 on 1 photographs"
+    assert yardstick.label == "real dB, protocol P3 on 1 photograph"
     assert poses(yardstick.views) <= poses(camera for camera in scene.cameras if camera.split == "test")
     good, bad = model.render(yardstick.views[0].zoomed(1 / 4), 1 / 4, "scaled", 4).image, torch.zeros(6, 8, 3)
     assert yardstick.psnr(yardstick.views[0], good) > 30 > yardstick.psnr(yardstick.views[0], bad)
@@ -88,9 +88,9 @@ def test_without_cameras_the_views_that_are_judged_on_look_from_above_what_is_sa
 
 def test_without_photographs_the_label_says_what_the_truth_is():
     out, between, in_ = (base_itself(wrapped(), scale, 1).label for scale in (1 / 4, 0.3, 4))
-    assert between == "dB against the base's image, made smaller (no photographs), 1 views"
-    assert out == "dB against the base supersampled 4 x 4 (no photographs), 1 views"
-    assert in_ == "dB of the image, shrunk, against the base itself (no photographs), 1 views"
+    assert between == "dB against the base's image, made smaller (no photographs), 1 view"
+    assert out == "dB against the base supersampled 4 x 4 (no photographs), 1 view"
+    assert in_ == "dB of the image, shrunk, against the base itself (no photographs), 1 view"
 
 
 # What is measured

@@ -36,11 +36,12 @@ TRUST = 0.05
 CONTRAST_POWER = 3
 
 
-def unused_network(config: AdaptConfig, scale: float) -> str | None:
-    """That a network was given which this adaptation does not use, and why; None if it is used, or if there is none."""
-    if config.upsampler in INTERPOLATIONS or (scale > 1 and config.steps and config.compare_at != "base"):
+def unused_upsampler(config: AdaptConfig, scale: float) -> str | None:
+    """That an upsampler was given which this adaptation does not use, and why; None if it is used, or if it is the one that nobody has to give."""
+    if config.upsampler == AdaptConfig.model_fields["upsampler"].default or (scale > 1 and config.steps and config.compare_at != "base"):
         return None
-    taken = f"recipe {config.recipe} takes no steps" if not config.steps else f"compare_at is {config.compare_at}"
+    instead = "; recipe paper uses it" if config.upsampler in INTERPOLATIONS else ""
+    taken = f"compare_at is {config.compare_at}{instead}" if config.steps else f"recipe {config.recipe} takes no steps"
     return f"the upsampler {config.upsampler} is not used, because {taken if scale > 1 else f'x{scale:g} is no zoom-in'}"
 
 

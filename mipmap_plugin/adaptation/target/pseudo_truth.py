@@ -36,7 +36,7 @@ class PseudoTruth:
         check_upsampler(config.upsampler)
         if photographs and (scale <= 1 or config.compare_at == "target" or not config.steps):
             only = "real images can be used only for a zoom-in that takes steps and is compared with the base at its own scale"
-            raise SettingsError(f"{only}; leave them out")
+            raise SettingsError(f"{only}; leave them (--images) out")
         self._photographs = photographs
         self._store = ImageStore(LIMIT, base.model.parameters()["means"])
 

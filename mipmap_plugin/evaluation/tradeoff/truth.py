@@ -59,7 +59,7 @@ def photographs(model: Wrapped, scene: Scene, scale: float, most: int | None) ->
     if doubt := of_another_scene(model, [judged[view] for view in views], scale, protocol):
         warnings.warn(doubt, stacklevel=2)
     truths = {view: judged[view].truth(scale, protocol) for view in views}
-    label = f"real dB, protocol P3 on {len(views)} photographs"
+    label = f"real dB, protocol P3 on {len(views)} photograph{'s' if len(views) > 1 else ''}"
     return GroundTruth(label, views, adapt_on, lambda view, image: psnr(protocol.as_saved(image), truths[view]), protocol.shrink_by)
 
 
@@ -73,14 +73,15 @@ def base_itself(model: Wrapped, scale: float, most: int | None, views: Sequence[
     held_out, adapt_on = _held_out(model)
     views = list(views) or evenly(held_out, most)
     base_images = {view: model.render(view).image.clamp(0, 1) for view in views}
+    counted = f"(no photographs), {len(views)} view{'s' if len(views) > 1 else ''}"
     if scale > 1:
-        label = f"dB of the image, shrunk, against the base itself (no photographs), {len(views)} views"
+        label = f"dB of the image, shrunk, against the base itself {counted}"
         return GroundTruth(label, views, adapt_on, lambda view, image: psnr(resize(image, view.size, "area"), base_images[view]), "area", (RESIZED,))
     n, itself = math.ceil(1 / scale), [RESIZED]
     made = "the base's image, made smaller"
     if all(view.size == tuple(n * side for side in view.zoomed(scale).size) for view in views):
         made, itself = f"the base supersampled {n} x {n}", [RESIZED, supersampled(n)]
-    label = f"dB against {made} (no photographs), {len(views)} views"
+    label = f"dB against {made} {counted}"
     truths = {view: resized_base(image, view.zoomed(scale).size, shrink_by="area") for view, image in base_images.items()}
     return GroundTruth(label, views, adapt_on, lambda view, image: psnr(image, truths[view]), "area", tuple(itself))
 
