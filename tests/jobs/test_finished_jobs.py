@@ -43,6 +43,21 @@ def test_a_file_is_finished_by_the_views_for_validation_that_were_asked_for(tmp_
         assert finished(made) is not None and finished(other) is None
 
 
+@pytest.mark.usefixtures("small_orbits")
+@pytest.mark.parametrize(("scale", "cameras", "fits", "other"), [
+    (1 / 2, True, "pil-bicubic", "area"),
+    (1 / 16, True, "area", "pil-bicubic"),  # 2 px
+    (1 / 16, False, "area", "pil-bicubic"),
+    (2.0, True, "pil-bicubic", "lanczos"),
+])  # fmt: skip
+def test_only_a_filter_that_fits_is_finished(tmp_path, scale, cameras, fits, other):
+    job = job_of(tmp_path, recipe="default", scale=scale, overwrite=True)
+    job = job if cameras else replace(job, base=replace(job.base, cameras=None))
+    for resize in (fits, other):
+        assert run_job(replace(job, settings=job.settings | {"resize": resize})).status == "done"
+        assert (finished(job) is not None) == (resize == fits)
+
+
 def test_another_base_or_another_file_is_not_finished(tmp_path):
     job = job_of(tmp_path)
     run_job(job)
