@@ -164,7 +164,8 @@ def test_the_report_says_what_was_enlarged(upsampler):
 @pytest.mark.parametrize(
     ("scale", "settings", "reason"),
     [
-        (2, dict(recipe="instant"), "recipe instant takes no steps"),
+        (2, dict(recipe="instant"), "no steps are taken"),
+        (2, dict(steps=0), "no steps are taken"),
         (2, dict(compare_at="base", steps=2), "compare_at is base"),
         (1 / 2, dict(steps=2), "x0.5 is no zoom-in"),
     ],

@@ -40,7 +40,7 @@ def unused_network(config: AdaptConfig, scale: float) -> str | None:
     """That a network was given which this adaptation does not use, and why; None if it is used, or if there is none."""
     if config.upsampler in INTERPOLATIONS or (scale > 1 and config.steps and config.compare_at != "base"):
         return None
-    taken = f"recipe {config.recipe} takes no steps" if not config.steps else f"compare_at is {config.compare_at}"
+    taken = "no steps are taken" if not config.steps else f"compare_at is {config.compare_at}"
     return f"the upsampler {config.upsampler} is not used, because {taken if scale > 1 else f'x{scale:g} is no zoom-in'}"
 
 
