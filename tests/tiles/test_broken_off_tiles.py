@@ -15,6 +15,7 @@ from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.errors import JobsFailed, OutputError, OutputExists, SceneError, SettingsError
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.jobs.engines import in_this_process
+from mipmap_plugin.models.places import PLAN
 from mipmap_plugin.models.reading import load_vanilla
 from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.tiles import plan, run, steering, tile
@@ -76,6 +77,16 @@ def test_tiles_of_another_request_are_not_touched(job):
 
 def failing(*_):
     raise OSError("no space left")
+
+
+def test_tiles_of_a_version_that_cut_across_sizes_are_refused(job):
+    """They ended in an error wherever a plane lay across an axis that is none."""
+    work_folder(job.target).mkdir()
+    plan.claim([job], 3)
+    file = work_folder(job.target) / PLAN
+    file.write_text(file.read_text().replace(f'"format": {plan.FORMAT}', '"format": 5'))
+    with pytest.raises(SettingsError, match="or of another version; repeat those, or delete it to start anew"):
+        adapt_in_tiles(job, 3)
 
 
 def test_tiles_are_not_gone_on_with_for_other_cameras(job, monkeypatch):
