@@ -30,7 +30,7 @@ from mipmap_plugin.progress import announced, counted
 from mipmap_plugin.tiles.folder import START, halo_file, layer_file, part_file, run_file, steered_file, truth_file, work_folder
 from mipmap_plugin.tiles.job import TileJob, Work
 from mipmap_plugin.tiles.judge import JOINED, judged
-from mipmap_plugin.tiles.plan import alone, claim, cut_for, refuse
+from mipmap_plugin.tiles.plan import alone, claim, cut_for, forget, refuse
 from mipmap_plugin.tiles.report import make_report
 from mipmap_plugin.tiles.scene import TiledScene, close_opened, opened
 from mipmap_plugin.tiles.steering import Steered, open_state, result, sweep_of
@@ -122,7 +122,7 @@ def _adapted_and_saved(scene: TiledScene, stages: _Stages, began: float, threads
         report = make_report(scene, files, facts, stages.seconds, validation, returned)
         saved = _save(scene, stages.job, files, Joined(stages.job.target, report, facts))
     close_opened()
-    shutil.rmtree(scene.folder)
+    forget(stages.job.target)
     return saved
 
 
