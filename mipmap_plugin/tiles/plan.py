@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.errors import MipmapPluginError, SettingsError
-from mipmap_plugin.formats.atomic import absolute, new_file, refuse_output, refuse_unwritable, sha256, write_json
+from mipmap_plugin.formats.atomic import new_file, refuse_output, refuse_unwritable, sha256, write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.splat_transform import is_written
-from mipmap_plugin.formats.staging import Staging, missing_folders, release, remove_empty
 from mipmap_plugin.formats.staging import claim as lock
+from mipmap_plugin.formats.staging import missing_folders, release, remove_empty
 from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.models.adapted_scale import refuse_adapted
 from mipmap_plugin.models.outputs import parts_of
@@ -62,20 +62,6 @@ def alone(jobs: Sequence[Job]) -> Iterator[None]:
                 raise SettingsError(f"{folder}: another command is making these tiles; wait until it has ended, or choose another output")
             held.callback(release, place, descriptor)
         yield
-
-
-def forget(target: Path) -> None:
-    """Delete the tiles of a scene that is written to `target`. They are moved away before, in one step, to where whoever asks for the target next
-    removes what a killed run left: a part of them would be in the way of other tiles. Raises OSError."""
-    folder = work_folder(target)
-    try:
-        staging = Staging(absolute(target))
-    except OSError:  # of a full disk, for one
-        return shutil.rmtree(folder)
-    try:
-        folder.rename(staging.new / folder.name)
-    finally:
-        staging.close()
 
 
 def claim(jobs: Sequence[Job], tiles: int) -> None:

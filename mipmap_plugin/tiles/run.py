@@ -16,7 +16,7 @@ from mipmap_plugin.adaptation.report import AS_IT_IS, Report
 from mipmap_plugin.adaptation.shown import refuse_blind, remarks, too_unlike
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.errors import JobsFailed, SettingsError
-from mipmap_plugin.formats.atomic import new_file, together, write_json
+from mipmap_plugin.formats.atomic import delete, new_file, together, write_json
 from mipmap_plugin.formats.ply_rows import concatenate
 from mipmap_plugin.formats.tags import with_tags
 from mipmap_plugin.jobs.engines import in_this_process
@@ -30,7 +30,7 @@ from mipmap_plugin.progress import announced, counted
 from mipmap_plugin.tiles.folder import START, halo_file, layer_file, part_file, run_file, steered_file, truth_file, work_folder
 from mipmap_plugin.tiles.job import TileJob, Work
 from mipmap_plugin.tiles.judge import JOINED, judged
-from mipmap_plugin.tiles.plan import alone, claim, cut_for, forget, refuse
+from mipmap_plugin.tiles.plan import alone, claim, cut_for, refuse
 from mipmap_plugin.tiles.report import make_report
 from mipmap_plugin.tiles.scene import TiledScene, close_opened, opened
 from mipmap_plugin.tiles.steering import Steered, open_state, result, sweep_of
@@ -122,7 +122,7 @@ def _adapted_and_saved(scene: TiledScene, stages: _Stages, began: float, threads
         report = make_report(scene, files, facts, stages.seconds, validation, returned)
         saved = _save(scene, stages.job, files, Joined(stages.job.target, report, facts))
     close_opened()
-    forget(stages.job.target)
+    delete(scene.folder, stages.job.target)
     return saved
 
 

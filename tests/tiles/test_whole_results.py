@@ -28,7 +28,6 @@ from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.splatting.packing import COLOR_LIMITS
 from mipmap_plugin.splatting.viewers import Viewer
 from mipmap_plugin.tiles import plan, run
-from mipmap_plugin.tiles.folder import work_folder
 from mipmap_plugin.tiles.reading import make_cut
 from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
 
@@ -37,7 +36,7 @@ from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
 
 def test_a_scene_in_tiles_is_whole_and_better_than_its_base(job, monkeypatch):
     bodies = []
-    monkeypatch.setattr(run, "forget", lambda target: bodies.extend((work_folder(target) / f"part_{n}.ply").read_bytes() for n in range(3)))
+    monkeypatch.setattr(run, "delete", lambda folder, _: bodies.extend((folder / f"part_{n}.ply").read_bytes() for n in range(3)))
     joined = adapt_in_tiles(replace(job, settings=job.settings | {"merge_to": 0.6}), 3)
     report = joined.report
     assert len(load_vanilla(joined.file)) == report.gaussians_after == sum(tile["splats_after"] for tile in joined.tiles[-3:])
