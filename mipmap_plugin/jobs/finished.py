@@ -94,7 +94,8 @@ def _fits(resize: str, cameras: Sequence[Camera], job: Job) -> bool:
     if (config := job.config()).resize != "fitting":
         return True
     somewhere = Viewpoints(Orbit((0.0, 0.0, 0.0), None, 1.0), list)  # the size of views does not depend on it
-    views, _ = choose_views(cameras, somewhere, config.model_copy(update={"extra_views": 1}))
+    as_large = {"extra_views": 1, "views": "train" if config.views == "jittered" else config.views}
+    views, _ = choose_views(cameras if job.images is None else (), somewhere, config.model_copy(update=as_large))
     drawn = ("classic", "antialiased") if job.base.screen_filter is None else (job.base.screen_filter,)
     return resize in [fitting(config, Effects(screen_filter=name), views, job.scale).resize for name in drawn]
 
