@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from mipmap_plugin.adaptation.optimization.amount import as_taken
 from mipmap_plugin.adaptation.target.portable import settings_for_several
 from mipmap_plugin.adaptation.target.resize import fitting
+from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.adaptation.viewpoints import Viewpoints
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.camera import Camera
@@ -82,10 +83,11 @@ def _is_requested(provenance: dict[str, Any], job: Job) -> bool:
 
 
 def _is_of_inputs(provenance: dict[str, Any], job: Job) -> bool:
-    """Whether what is given beside the checkpoint is the job's: a hash of the cameras, the background, the screen filter, and a hash of the
-    photographs; and the filter that makes images smaller is one that fits these cameras, where the settings leave its choice."""
+    """Whether what is given beside the checkpoint is the job's: a hash of the cameras, the background, the screen filter, and hashes of the
+    photographs and of a network; and the filter that makes images smaller is one that fits these cameras, where the settings leave its choice."""
     cameras = job.base.own_cameras()
-    inputs = job.base.asked(cameras) | ({} if job.images is None else {"photographs": job.base.photographs(job.images).digest()})
+    photographs = {} if job.images is None else {"photographs": job.base.photographs(job.images).digest()}
+    inputs = job.base.asked(cameras) | photographs | network_input(job.config().upsampler)
     return provenance.get("inputs") == inputs and _fits(provenance["settings"]["resize"], cameras, job)
 
 

@@ -89,6 +89,15 @@ def test_other_cameras_background_or_photographs_are_not_finished(tmp_path):
     assert finished(job) is not None
 
 
+def test_another_network_of_that_name_is_not_finished(tmp_path):
+    network = tmp_path / "net.pth"
+    network.write_bytes(b"one")
+    job = job_of(tmp_path, scale=2.0, settings={"steps": 0, "seed": 0, "views": "given", "upsampler": str(network)})
+    assert run_job(job).status == "done" and finished(job) is not None
+    network.write_bytes(b"other")
+    assert finished(job) is None
+
+
 @pytest.mark.usefixtures("small_orbits")
 def test_another_vertical_is_not_finished(tmp_path):
     job = job_of(tmp_path)
