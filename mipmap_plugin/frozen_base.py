@@ -23,6 +23,7 @@ from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import LIMIT, BaseImages
 from mipmap_plugin.adaptation.target.photographs import Photographs, placed, scene_of
 from mipmap_plugin.adaptation.target.portable import settings_for_several
+from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.adaptation.viewpoints import ClearViews, Viewpoints, orbit_of
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.backends import choose_backend
@@ -184,14 +185,13 @@ class FrozenBase:
         scene = None if images is None else scene_of(self.model, images)
         state = None if resume is None else path_of(resume, "resume")
         model = self._fused if viewer is not None and self.model.traits.filtered else self.model
-        settings = mergeable_settings(model, settings)
         if scene and self.model.traits.exposures.changed:
             raise SettingsError("the images were exposed differently, which adaptation does not support (exposure.json); leave them out")
         there = self.place(scene) if scene else None
-        config, targets = self._planned(recipe, scale, viewer, settings, cameras or ())
+        config, targets = self._planned(recipe, scale, viewer, mergeable_settings(model, settings), cameras or ())
         first = conversion(config, self.effects(), targets.values(), scale) if finer is None else None
         views = {} if cameras is None else {"views": digest_of(cameras)}
-        inputs = self.asked | views | ({"photographs": scene.digest()} if scene else {})
+        inputs = self.asked | views | ({"photographs": scene.digest()} if scene else {}) | network_input(config.upsampler)
         photographs = Photographs(there, self.cameras, self.background) if there else None
         cameras = (photographs or self).cameras if cameras is None else cameras
         needs = [replace(self._needs, screen_filter=target.screen_filter, settings=target.settings) for target in targets.values()]

@@ -1,5 +1,6 @@
 """Zoom-in with an upsampler: which part of its image is believed, and that a bad one does no harm."""
 
+import itertools
 import math
 from types import SimpleNamespace
 
@@ -164,7 +165,8 @@ def test_the_report_says_what_was_enlarged(upsampler):
 @pytest.mark.parametrize(
     ("scale", "settings", "reason"),
     [
-        (2, dict(recipe="instant"), "recipe instant takes no steps"),
+        (2, dict(recipe="instant"), "no steps are taken"),
+        (2, dict(steps=0), "no steps are taken"),
         (2, dict(compare_at="base", steps=2), "compare_at is base"),
         (1 / 2, dict(steps=2), "x0.5 is no zoom-in"),
     ],
@@ -202,6 +204,23 @@ def test_a_network_leaves_half_of_a_time_budget_to_the_steps(upsampler, monkeypa
     report = adapted("mine", time_budget_s=60.0).report
     assert len(asked) == 1 and 0 < asked[0] < 30 and report.views == "the 6 train views, 2 of them upsampled"
     assert report.settings.steps and report.curve[-1].step > 0
+
+
+def test_a_run_that_goes_on_enlarges_its_views_again_however_long_its_start_takes(upsampler, monkeypatch, tmp_path):
+    """Such as one whose kernels are compiled again: all views were enlarged within steps, whatever the time, and the report said nothing of it."""
+    upsampler(lambda image, size: resize(image, size, "lanczos"))
+    monkeypatch.setattr(DetailLoss, "prepare", lambda self, views, seconds: views[:2])
+
+    def press(step, seconds, render):
+        if step == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        adapted("mine", steps=4, time_budget_s=60.0, resume=tmp_path / "state", observe=press)
+    clock = itertools.count(step=100)
+    monkeypatch.setattr("mipmap_plugin.adaptation.session.now", lambda device: float(next(clock)))
+    report = adapted("mine", steps=4, time_budget_s=60.0, resume=tmp_path / "state").report
+    assert report.curve[-1].step == 4 and report.views == "the 6 train views, 2 of them upsampled"
 
 
 @pytest.mark.parametrize("keeps", [False, True])

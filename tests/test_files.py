@@ -161,6 +161,20 @@ def test_what_dead_runs_left_is_put_right_by_whoever_comes_next(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
 
 
+def test_a_disk_that_takes_no_further_folder_keeps_nothing_hidden(tmp_path, monkeypatch):
+    mkdir = Path.mkdir
+
+    def full(folder, *options, **named):
+        if folder.name == "new":
+            raise OSError(28, "No space left on device")
+        mkdir(folder, *options, **named)
+
+    monkeypatch.setattr(Path, "mkdir", full)
+    with pytest.raises(OutputError, match="No space left on device"):
+        write_json(tmp_path / "a.json", {}, overwrite=False)
+    assert not list(tmp_path.iterdir())
+
+
 def test_what_a_living_run_makes_is_let_alone(tmp_path):
     with new_file(tmp_path / "a", False) as first:
         first.write_text("first")

@@ -188,7 +188,7 @@ class Session:
         keeper = StateKeeper(resume, self._fingerprint())
         if not any(target.sh_degree for target in self.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no viewer evaluates view-dependent color, so that these coefficients need no gradient
-        if self.detail is not None and (seconds := for_upsampling(self.config, self.seconds["total"])) > 0:
+        if self.detail is not None and (seconds := for_upsampling(self.config, self.seconds["total"], resume)) > 0:
             with self.phase("upsampling"), threads.lent_to_torch():
                 self.views = self.detail.prepare(self.views, seconds)
             self.views_note += f", {len(self.views)} of them upsampled"

@@ -13,6 +13,7 @@ from mipmap_plugin.commands.common import print_json
 from mipmap_plugin.commands.pages import PAGE, look_at, write_levels_page
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import MipmapPluginError, OutputError, SettingsError
+from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.formats.splat_transform import LOD_META, refuse_exchange
 from mipmap_plugin.progress import announced
 
@@ -73,7 +74,7 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     from mipmap_plugin.models.places import state_path
     from mipmap_plugin.process import threads
 
-    unfinished = state_path(output)
+    unfinished = settled(state_path(output))
     refuse_ladder(output, wrapped, overwrite=overwrite)
     with announced("planning the levels"):
         refuse_ladder(output, wrapped, overwrite=overwrite, room=room_for(wrapped, request, unfinished))

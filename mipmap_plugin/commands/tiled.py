@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 def adapt_tiled(many: Many, given: Sequence[Path], request: Request, base: Base, threads: int | None, json: bool) -> None:
     """Adapt one checkpoint to each scale and viewer in tiles. Raises SettingsError before any work, JobsFailed."""
+    from mipmap_plugin.tiles.plan import unlock
     from mipmap_plugin.tiles.run import adapt_all_in_tiles
 
     if many.tiles is None or many.is_list(given) or many.shard is not None:
@@ -34,6 +35,7 @@ def adapt_tiled(many: Many, given: Sequence[Path], request: Request, base: Base,
     skip = many.skip_existing or (len(jobs) > 1 and not request.overwrite)  # as in a list
     reports = finished_before(jobs, json, may_load=False) if skip else {}  # the base may not fit into memory
     left = [job for job in jobs if job.target not in reports]
+    unlock([job for job in jobs if job.target in reports])
     try:
         for job, joined in zip(left, adapt_all_in_tiles(left, many.tiles, run, threads), strict=True):
             reports[job.target] = {"file": str(joined.file), **joined.facts()}

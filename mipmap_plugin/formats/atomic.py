@@ -173,6 +173,18 @@ def settled(path: Path) -> Path:
     return path
 
 
+def delete(folder: Path, output: Path | None = None) -> None:
+    """Delete a folder of unfinished work, as far as the system lets this run. It is moved away before, in one step: a part of it, which a killed run
+    leaves, would be in the way of others. Whoever asks for `output`, by default the folder, next removes what is left (`settled`)."""
+    with contextlib.suppress(OSError):
+        staging = Staging(absolute(output or folder))
+        try:
+            os.rename(folder, staging.new / folder.name)
+        finally:
+            staging.close()
+    shutil.rmtree(folder, ignore_errors=True)
+
+
 def kind_of_node(status: os.stat_result) -> str:
     """The kind of a path that is neither a regular file nor a folder."""
     kinds = {stat.S_ISFIFO: "a pipe", stat.S_ISCHR: "a device", stat.S_ISBLK: "a device", stat.S_ISSOCK: "a socket"}

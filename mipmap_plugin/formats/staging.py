@@ -41,7 +41,11 @@ class Staging:
         settle(path)
         self._folder, self._lock = _free_slot(path)
         self.new = self._folder / "new"
-        self.new.mkdir()
+        try:
+            self.new.mkdir()
+        except BaseException:  # of a full disk, or Ctrl-C
+            release(self._folder, self._lock)
+            raise
 
     def inside(self, path: Path) -> Path | None:
         """The staging path of `path` (absolute): here, if it is the output, beside it, or in a folder that is being written."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.process.garbage import uncollected
 
 if TYPE_CHECKING:
+    from mipmap_plugin.camera import Camera
     from mipmap_plugin.scenes import Scene
     from mipmap_plugin.wrap import Wrapped
 
@@ -27,15 +29,22 @@ class Base:
     screen_filter: str | None = None
     up: str | None = None  # such as "z"; None: as the checkpoint says, if it does
 
-    def asked(self) -> dict[str, str]:
-        """What is given beside the checkpoint, as its adaptations record it, without loading it. Raises CheckpointError, SceneError."""
+    def asked(self, cameras: Sequence[Camera] | None = None) -> dict[str, str]:
+        """What is given beside the checkpoint, as its adaptations record it, without loading it. `cameras`: its own (`own_cameras`), if they are read
+        already. Raises CheckpointError, SceneError."""
+        from mipmap_plugin.wrap import asked_for
+
+        cameras = self.own_cameras() if cameras is None else cameras
+        return asked_for(self._model_folder(), cameras, COLORS[self.background], self.screen_filter, self.up)
+
+    def own_cameras(self) -> Sequence[Camera]:
+        """The cameras that are given, or else those that the checkpoint has, without loading it. Raises CheckpointError, SceneError."""
         from mipmap_plugin.adaptation.cameras_of_base import own_cameras
         from mipmap_plugin.models import detect
-        from mipmap_plugin.wrap import asked_for
 
         folder = self._model_folder()
         found = self._given_scene(folder) or own_cameras(detect(self.checkpoint).path, folder)[0]
-        return asked_for(folder, found if isinstance(found, list) else found.cameras, COLORS[self.background], self.screen_filter, self.up)
+        return found if isinstance(found, list) else found.cameras
 
     def photographs(self, path: Path) -> Scene:
         """The scene at `path`, to whose photographs the checkpoint is compared or adapted. Raises CheckpointError, SceneError."""

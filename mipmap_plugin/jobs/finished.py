@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,13 @@ from pydantic import ValidationError
 
 from mipmap_plugin.adaptation.optimization.amount import as_taken
 from mipmap_plugin.adaptation.target.portable import settings_for_several
+from mipmap_plugin.adaptation.target.resize import fitting
+from mipmap_plugin.adaptation.target.upsamplers import network_input
+from mipmap_plugin.adaptation.viewpoints import Viewpoints
+from mipmap_plugin.adaptation.views import choose_views
+from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.atomic import named, settled, sha256
 from mipmap_plugin.formats.ply import read_header
@@ -21,6 +27,7 @@ from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.models import detect
 from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.recipes import recipe
+from mipmap_plugin.scenes.orbits import Orbit
 from mipmap_plugin.splatting.viewers import viewers_for
 
 
@@ -28,7 +35,7 @@ def finished(job: Job, *, may_load: bool = True) -> tuple[Path, dict[str, Any]] 
     """The checkpoint that the job would make, and its report, if they are there already; None if not. may_load: see `_digest`."""
     for file, report in _outputs(job.target):
         provenance = _in_header(file) or report
-        same = _is_requested(provenance, job) and provenance.get("inputs") == _inputs(job)
+        same = _is_requested(provenance, job) and _is_of_inputs(provenance, job)
         if same and provenance.get("base") == _digest(job, provenance.get("base"), may_load):
             return file, report
     return None
@@ -59,7 +66,7 @@ def _in_header(file: Path) -> dict[str, Any] | None:
 
 
 def _is_requested(provenance: dict[str, Any], job: Job) -> bool:
-    """Whether scale, viewer and settings are those of the job."""
+    """Whether scale, viewer and settings are those of the job, but for a filter that fits (`_fits`)."""
     try:
         settings = AdaptConfig.model_validate(provenance.get("settings"))
     except ValidationError:  # of another version
@@ -69,13 +76,30 @@ def _is_requested(provenance: dict[str, Any], job: Job) -> bool:
         expected = recipe(job.recipe, job.scale, **(settings_for_several(expected) | job.settings))
     if "merge_to" not in job.settings and settings.merge_to == 1:  # splats of this family are not merged
         expected = expected.model_copy(update={"merge_to": 1.0})
+    if expected.resize == "fitting":
+        expected = expected.model_copy(update={"resize": settings.resize})
     wanted = (job.scale, job.viewer, as_taken(expected, settings))  # the same base has the same size
     return (provenance.get("scale"), provenance.get("viewer"), settings) == wanted
 
 
-def _inputs(job: Job) -> dict[str, str]:
-    """What is given beside the checkpoint: a hash of the cameras, the background, the screen filter, and a hash of the photographs."""
-    return job.base.asked() | ({} if job.images is None else {"photographs": job.base.photographs(job.images).digest()})
+def _is_of_inputs(provenance: dict[str, Any], job: Job) -> bool:
+    """Whether what is given beside the checkpoint is the job's: a hash of the cameras, the background, the screen filter, and hashes of the
+    photographs and of a network; and the filter that makes images smaller is one that fits these cameras, where the settings leave its choice."""
+    cameras = job.base.own_cameras()
+    photographs = {} if job.images is None else {"photographs": job.base.photographs(job.images).digest()}
+    inputs = job.base.asked(cameras) | photographs | network_input(job.config().upsampler)
+    return provenance.get("inputs") == inputs and _fits(provenance["settings"]["resize"], cameras, job)
+
+
+def _fits(resize: str, cameras: Sequence[Camera], job: Job) -> bool:
+    """Whether `fitting` may have chosen a filter: of a zoom-in it depends on the base's screen filter, which only loading the base might tell."""
+    if (config := job.config()).resize != "fitting":
+        return True
+    somewhere = Viewpoints(Orbit((0.0, 0.0, 0.0), None, 1.0), list)  # the size of views does not depend on it
+    as_large = {"extra_views": 1, "views": "train" if config.views == "jittered" else config.views}
+    views, _ = choose_views(cameras if job.images is None else (), somewhere, config.model_copy(update=as_large))
+    drawn = ("classic", "antialiased") if job.base.screen_filter is None else (job.base.screen_filter,)
+    return resize in [fitting(config, Effects(screen_filter=name), views, job.scale).resize for name in drawn]
 
 
 def _digest(job: Job, wanted: Any, may_load: bool) -> str:

@@ -6,7 +6,7 @@ import time
 import traceback
 from dataclasses import replace
 
-from mipmap_plugin.errors import MipmapPluginError, OutputExists
+from mipmap_plugin.errors import MipmapPluginError, OutputExists, of_a_file
 from mipmap_plugin.jobs.finished import finished
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.limits import is_out_of_memory
@@ -27,8 +27,10 @@ def _attempt(job: Job, threads: int | None) -> Outcome:
     except OutputExists as error:
         # Another process may have finished the same job meanwhile.
         return _finished_before(job) or Outcome(job, "failed", reason=told(error))
-    except (MipmapPluginError, OSError) as error:
+    except MipmapPluginError as error:
         return Outcome(job, "failed", reason=told(error))
+    except OSError as error:
+        return Outcome(job, "failed", reason=told(of_a_file(error)))
     except Exception as error:
         if isinstance(error, (MemoryError, RuntimeError)) and is_out_of_memory(error):
             return Outcome(job, "failed", reason="out of memory; use a smaller scale, fewer views or fewer jobs at a time")

@@ -164,4 +164,4 @@ class Band:
         """The settings of AdaptConfig for this band."""
         kept = KEPT * (self.ratio**POWER - 1) * self.scale**POWER  # a geometric series, whose sum is KEPT
         merging = {"merge_to": min(1.0, kept)} if self.scale < 1 else {}
-        return {"band": (self.low / self.scale, self.high / self.scale), "resize": "pil-bicubic", **merging}
+        return {"band": (self.low / self.scale, self.high / self.scale), "resize": "fitting", **merging}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,7 +14,7 @@ from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.report import Report, versions
 from mipmap_plugin.camera import digest_of
 from mipmap_plugin.errors import MipmapPluginError, SettingsError, brief
-from mipmap_plugin.formats.atomic import json_text, refuse_unwritable, settled, write_json
+from mipmap_plugin.formats.atomic import delete, json_text, refuse_unwritable, settled, write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.request import LadderRequest
@@ -40,7 +39,7 @@ class LevelStore:
         if folder is None:
             return
         self._facts = json.loads(json_text(_facts(base, request)))
-        self._refuse_others(folder)
+        self._refuse_others(settled(folder))
 
     def _refuse_others(self, folder: Path) -> None:
         """Raise what `__init__` raises. The state of a run, which says itself what it belongs to, is no level yet."""
@@ -72,7 +71,7 @@ class LevelStore:
     def remove(self) -> None:
         """Delete the folder, whose levels have been saved elsewhere."""
         if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
+            delete(self._folder)
 
     def _loaded(self, file: Path) -> Adapted:
         """A level as it is in its file. Every level is read, also one just made, so that a ladder is the same whether it was interrupted or not."""

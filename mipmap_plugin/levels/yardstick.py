@@ -12,7 +12,7 @@ from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import psnr_as_shown
 from mipmap_plugin.adaptation.optimization.validation import WINDOW
 from mipmap_plugin.adaptation.shown import showing
-from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.adaptation.target.resize import filter_for, resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.limits import derived_seed
@@ -25,10 +25,10 @@ VIEWS, TRIED = 4, 4
 # Number of the random draw, apart from those of views that are adapted to and of validation.
 DRAW = 104_729
 
-# The filter that shrinks the base's images, as for the pseudo truth.
-RESIZE = "pil-bicubic"
-
-TRUTH = f"mean PSNR over at most {VIEWS} random views that no level was adapted to, against the base's own images at x1, shrunk by {RESIZE}"
+TRUTH = (
+    f"mean PSNR over at most {VIEWS} random views that no level was adapted to, against the base's own images at x1, shrunk by pil-bicubic"
+    " (to 1 or 2 px by area)"
+)
 
 
 class Yardstick:
@@ -60,4 +60,9 @@ class Yardstick:
 
     def _mean(self, compare: Callable[[Camera, Tensor], float], zoom: float) -> float:
         cameras = {view: view.zoomed(zoom) for view in self._views}
-        return fmean(compare(camera, resize(self._images[view], camera.size, RESIZE)) for view, camera in cameras.items())
+        return fmean(compare(camera, shrunk(self._images[view], camera)) for view, camera in cameras.items())
+
+
+def shrunk(image: Tensor, camera: Camera) -> Tensor:
+    """The base's own image of a view as `camera` sees that, [h, w, 3], with the filter that pseudo truths of this size have."""
+    return resize(image, camera.size, filter_for(min(camera.size)))

@@ -9,10 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.levels.contents import Contents
-from mipmap_plugin.levels.yardstick import RESIZE, VIEWS, Yardstick
+from mipmap_plugin.levels.yardstick import VIEWS, Yardstick, shrunk
 from mipmap_plugin.pages.gallery import effects_of_base
 from mipmap_plugin.pages.record import Page, Picture, Role, Zoom, zoom_name
 
@@ -39,7 +38,7 @@ def _zoom(ladder: Contents, yardstick: Yardstick, scale: float) -> Zoom:
     """The base in the viewer, the level that is shown, at a switch the next one too, and the supersampled base."""
     viewer, (view, image) = ladder.request.viewer, yardstick.example()
     camera = view.zoomed(scale)
-    truth = resize(image, camera.size, RESIZE).clamp(0, 1)
+    truth = shrunk(image, camera).clamp(0, 1)
     base = ladder.base.render(camera, viewer=viewer).image
     pictures = [_picture(f"base in {viewer}", "base", base, truth, yardstick.psnr_of_base(ladder.base, viewer, scale))]
     for name, role, number in _shown(ladder, scale):

@@ -25,7 +25,7 @@ from mipmap_plugin.tiles.folder import BASE, CUT, work_folder
 from mipmap_plugin.tiles.reading import find_splats, make_cut
 
 # Of the folder's files: those of another format are not gone on with.
-FORMAT = 5
+FORMAT = 6
 
 
 def refuse(job: Job, tiles: int) -> None:
@@ -57,11 +57,23 @@ def alone(jobs: Sequence[Job]) -> Iterator[None]:
         for folder in dict.fromkeys(work_folder(job.target) for job in jobs):
             held.callback(remove_empty, missing_folders(folder.parent))
             folder.parent.mkdir(parents=True, exist_ok=True)
-            place = folder.with_name(f".{folder.name}.lock")
+            place = _lock_of(folder)
             if (descriptor := lock(place)) is None:
                 raise SettingsError(f"{folder}: another command is making these tiles; wait until it has ended, or choose another output")
             held.callback(release, place, descriptor)
         yield
+
+
+def unlock(jobs: Sequence[Job]) -> None:
+    """Remove the locks of a command that was killed, as far as the system lets this one: of jobs that are finished, which need none any more."""
+    for place in (_lock_of(work_folder(job.target)) for job in jobs):
+        with suppress(OSError):
+            if place.exists() and (descriptor := lock(place)) is not None:
+                release(place, descriptor)
+
+
+def _lock_of(folder: Path) -> Path:
+    return folder.with_name(f".{folder.name}.lock")
 
 
 def claim(jobs: Sequence[Job], tiles: int) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -15,8 +15,8 @@ import torch
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report
 from mipmap_plugin.adaptation.shown import refuse_blind, remarks, too_unlike
 from mipmap_plugin.adaptation.warn import warn
-from mipmap_plugin.errors import JobsFailed, SettingsError
-from mipmap_plugin.formats.atomic import new_file, together, write_json
+from mipmap_plugin.errors import BackendUnavailable, JobsFailed, SceneError, SettingsError
+from mipmap_plugin.formats.atomic import delete, new_file, together, write_json
 from mipmap_plugin.formats.ply_rows import concatenate
 from mipmap_plugin.formats.tags import with_tags
 from mipmap_plugin.jobs.engines import in_this_process
@@ -79,9 +79,10 @@ def _adapt_all(jobs: Sequence[Job], tiles: int, engine: Engine, threads: int | N
     with announced("cutting"):
         cut_for(jobs, tiles)
     return_freed_memory()
-    for job in jobs:
-        _opened(job).wrapped.refuse_output(job.target, overwrite=job.overwrite, networks_move=False, viewer=job.viewer)
-    _examine_views(jobs)
+    with _uncut_if_refused(jobs):
+        for job in jobs:
+            _opened(job).wrapped.refuse_output(job.target, overwrite=job.overwrite, networks_move=False, viewer=job.viewer)
+        _examine_views(jobs)
     for number, job in enumerate(jobs):
         stages = _Stages(job, tuple(jobs[number + 1 :]), engine, {"cutting": time.perf_counter() - began})
         yield _adapted_and_saved(_opened(job), stages, began, threads)
@@ -92,18 +93,24 @@ def _opened(job: Job) -> TiledScene:
     return opened(job.base, job.scale, job.viewer, job.config(), work_folder(job.target))
 
 
+@contextmanager
+def _uncut_if_refused(jobs: Sequence[Job]) -> Iterator[None]:
+    """Delete the tiles of a request that is refused, if they were only cut: other settings or cameras need other ones."""
+    try:
+        yield
+    except (SettingsError, SceneError, BackendUnavailable):
+        close_opened()
+        for folder in (work_folder(job.target) for job in jobs):
+            if not truth_file(folder, 0).exists():
+                delete(folder)
+        raise
+
+
 def _examine_views(jobs: Sequence[Job]) -> None:
     """Warn of what is wrong with views, as without tiles, but by a sample of the splats. Raises SettingsError for views that show nothing."""
     for scene in map(_opened, jobs):
         model, views, near = scene.wrapped.model, scene.views.adapted, scene.base_effects.near_plane
-        try:
-            refuse_blind(views, model, near, partial(draw_base, scene), scene.scale)
-        except SettingsError:
-            close_opened()
-            for folder in (work_folder(job.target) for job in jobs):
-                if not truth_file(folder, 0).exists():  # it was only cut, and other cameras need another folder
-                    shutil.rmtree(folder)
-            raise
+        refuse_blind(views, model, near, partial(draw_base, scene), scene.scale)
         orbit = not scene.wrapped.cameras or scene.config.views == "orbit"
         for remark in filter(None, [*remarks(views, model, near, orbit=orbit), too_unlike(views)]):
             warn(remark)
@@ -122,7 +129,7 @@ def _adapted_and_saved(scene: TiledScene, stages: _Stages, began: float, threads
         report = make_report(scene, files, facts, stages.seconds, validation, returned)
         saved = _save(scene, stages.job, files, Joined(stages.job.target, report, facts))
     close_opened()
-    shutil.rmtree(scene.folder)
+    delete(scene.folder, stages.job.target)
     return saved
 
 

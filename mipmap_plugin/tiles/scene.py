@@ -71,7 +71,8 @@ class TiledScene:
         self.wrapped.targets(viewer)  # raises for what no viewer draws
         self.target = self.wrapped.effects(viewer=viewer)  # the sample does not tell whether splats that another near plane shows are in view
         self.backend, self.backend_note = self._backend(base.backend)
-        self.asked_steps, self.config = config.steps, self._affordable(config, scale)
+        self.asked_steps, self.config = config.steps, config
+        self._fit()
 
     def _wrapped(self, base: Base, sample: Tensor) -> Wrapped:
         """Some of the splats with the cameras of all."""
@@ -88,10 +89,10 @@ class TiledScene:
         splats = self.wrapped.model.gaussians(self.wrapped.any_camera())
         return choose_backend(name, Needs.of(splats, self.base_effects, gradients=True), Needs.of(splats, self.target, gradients=True))
 
-    def _affordable(self, config: AdaptConfig, scale: float) -> AdaptConfig:
-        """The settings with no more steps than a scene of this size can have, as without tiles."""
-        config = fitting(config, self.base_effects, self.wrapped.cameras, scale)
-        return affordable_for(config, self.base.places[:, :3], self.wrapped.cameras, self.target.near_plane)
+    def _fit(self) -> None:
+        """Let the settings have no more steps than a scene of this size can have, and the filter that fits its views, as without tiles."""
+        self.config = affordable_for(self.config, self.base.places[:, :3], self.wrapped.cameras, self.target.near_plane)
+        self.config = fitting(self.config, self.base_effects, self.views.adapted, self.scale)
 
     @cached_property
     def base_effects(self) -> Effects:
@@ -139,9 +140,10 @@ class TiledScene:
         other = copy(self)
         other.scale, other.viewer, other.folder = job.scale, job.viewer, folder
         other.target = self.wrapped.effects(viewer=job.viewer)
-        other.config = other._affordable(job.config(), job.scale)
         for name in ("views", "sweeps", "used_views"):
             other.__dict__.pop(name, None)
+        other.config = job.config()
+        other._fit()
         return other
 
     def for_target(self, parameters: dict[str, Tensor]) -> VanillaModel:

@@ -6,12 +6,14 @@ slab behind what the slabs before it let through: C = C_1 + T_1 (C_2 + T_2 (...)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.start.blend_weights import SHOWN
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -74,23 +76,35 @@ class Painter:
         """The picture [H, W, 3] of all splats in front of the background."""
         return self.draw(splats, camera).over(torch.tensor(self.effects.background))
 
-    def blend_weights(self, splats: Splats, cameras: list[Camera]) -> Tensor:
+    def blend_weights(self, splats: Splats, cameras: Sequence[Camera]) -> Tensor:
         """The mean blend weight [N] of each splat over views, in pixels (`start.blend_weights`, for splats on the disk)."""
+        return self.weighed(splats, cameras)[0]
+
+    def weighed(self, splats: Splats, cameras: Sequence[Camera]) -> tuple[Tensor, float]:
+        """`blend_weights`, and the fraction of the splats that a view shows, mean over views; what is hidden behind others does not count."""
+        total, shown = torch.zeros(len(splats)), 0.0
+        for view in cameras:
+            weights = torch.zeros(len(splats))
+            for strip in strips(view):
+                self._weigh(splats, strip, weights)
+            total += weights / len(cameras)
+            shown += float((weights > SHOWN).float().mean()) / len(cameras)
+        return total, shown
+
+    def _weigh(self, splats: Splats, camera: Camera, weights: Tensor) -> None:
+        """Add the blend weight of each splat in a view to `weights` [N]."""
         settings = self.effects.settings.without_color_rounding()
         effects = replace(self.effects, background=BLACK, sh_degree=0, settings=settings)
-        weights = torch.zeros(len(splats))
-        for camera in (strip for view in cameras for strip in strips(view)):
-            parts = slabs(*splats.seen_by(camera, effects.near_plane), COLORLESS_SLAB)
-            through = torch.ones(*camera.size, 1)
-            for slab in parts:
-                gaussians = splats.gaussians(slab, colored=False)
-                if len(parts) == 1 and (known := self._known_weights(gaussians, camera, effects)) is not None:
-                    weights[slab] += known / len(cameras)
-                    break
-                weights[slab] += self._slab_weights(gaussians, camera, effects, through) / len(cameras)
-                if float(through.max()) < effects.settings.min_transmittance:
-                    break
-        return weights
+        parts = slabs(*splats.seen_by(camera, effects.near_plane), COLORLESS_SLAB)
+        through = torch.ones(*camera.size, 1)
+        for slab in parts:
+            gaussians = splats.gaussians(slab, colored=False)
+            if len(parts) == 1 and (known := self._known_weights(gaussians, camera, effects)) is not None:
+                weights[slab] += known
+                return
+            weights[slab] += self._slab_weights(gaussians, camera, effects, through)
+            if float(through.max()) < effects.settings.min_transmittance:
+                return
 
     def _known_weights(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor | None:
         """The blend weights [M] that the backend computes itself, if it can, of splats with nothing in front of them."""

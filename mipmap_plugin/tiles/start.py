@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.validation import mean_db
-from mipmap_plugin.adaptation.pixel_size import enough_views, pixel_size
+from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS, pixel_size, views_for
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.blend_weights import may_show, whole_weights
 from mipmap_plugin.adaptation.start.candidates import mildest_costs, start_name
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import matched_opacities
 from mipmap_plugin.adaptation.start.merging import merge_seen
-from mipmap_plugin.camera import evenly
+from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.vanilla import VanillaModel
@@ -41,15 +41,15 @@ class StartSearch:
         effects = scene.base_effects, scene.target
         self.forms = scene.config.closed_form and not (filter_suffices(*effects) or draws_alike(*effects))
         self.matches = scene.scale <= 1 and self.forms
-        self.views = evenly(scene.views.adapted, enough_views(scene.base.places[:, :3], scene.views.adapted))
+        self.views: list[Camera] = []  # those in which blend weights are measured, which `_measured` finds
 
     @torch.no_grad()
     def run(self) -> None:
         """Write the start of each tile, and `start.pt`: its name, and its PSNR on the steering views."""
-        scene, config, base_db = self.scene, self.scene.config, self.steer(self.scene.base)
+        config, base_db = self.scene.config, self.steer(self.scene.base)
         if not (self.forms or config.merge_to < 1):
             return self._take_base(base_db)
-        weights = scene.painter(scene.base_effects).blend_weights(scene.base, self.views) * scene.scale**2
+        weights = self._measured()
         pool.release_to_system()
         self._candidate("formed", weights, 1.0)
         formed_db = self.steer(self._open("formed"))
@@ -58,6 +58,16 @@ class StartSearch:
         if formed_db < base_db or not self.forms:
             return self._take_base(base_db)
         self._take("formed", start_name(self.forms), formed_db)
+
+    def _measured(self) -> Tensor:
+        """[N]: the blend weights of the base's splats, in target pixels of a view, from as many views as show enough of them, as without tiles."""
+        scene, painter = self.scene, self.scene.painter(self.scene.base_effects)
+        first = evenly(scene.views.adapted, LEAST_VIEWS)
+        weights, shown = painter.weighed(scene.base, first)
+        self.views = evenly(scene.views.adapted, views_for(shown))
+        if further := [view for view in self.views if view not in first]:
+            weights = weights.lerp(painter.blend_weights(scene.base, further), len(further) / (len(first) + len(further)))
+        return weights * scene.scale**2
 
     def _takes_merged(self, weights: Tensor, formed_db: float, base_db: float) -> bool:
         """Take the strongest merging that costs little, and return whether there is one; where the mildest costs too much, no other is tried."""
@@ -106,7 +116,7 @@ class StartSearch:
 
         def sizes(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
             """Of a base pixel at each splat, and of the splat's weight if nothing hid it."""
-            pixel = pixel_size(gaussians.means, scene.views.adapted)
+            pixel = pixel_size(gaussians.means, scene.views.adapted, len(self.views))
             return pixel, whole_weights(gaussians, pixel, scene.views.adapted, scene.base_effects, scene.scale)
 
         def merged(gaussians: Gaussians) -> Gaussians:
@@ -117,7 +127,8 @@ class StartSearch:
 
         def formed(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
             pixel, found[1] = sizes(gaussians)
-            form = FormSettings(1.0 if self.matches else AREA_POWER, scene.config.crispness, pixel=pixel if scene.scale <= 1 else None)
+            known = pixel if scene.scale <= 1 else None
+            form = FormSettings(1.0 if self.matches else AREA_POWER, scene.config.crispness, len(self.views), known)
             return closed_form(gaussians, scene.views.adapted, scene.scale, scene.base_effects, scene.target, form)
 
         if fraction < 1:

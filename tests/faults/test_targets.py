@@ -274,6 +274,20 @@ def test_states_beyond_the_last_are_refused(tmp_path):
 # The cache
 
 
+def test_ctrl_c_while_a_state_is_let_go_of_leaves_nothing_to_do_again(tmp_path, monkeypatch):
+    """Its lock was closed a second time, as the object went, which was printed with a traceback."""
+
+    def broken_off(folder, lock):
+        os.close(lock)
+        raise KeyboardInterrupt
+
+    file = claim_state_file(tmp_path / "state", lambda _: "")
+    monkeypatch.setattr("mipmap_plugin.adaptation.optimization.state_file.release", broken_off)
+    with pytest.raises(KeyboardInterrupt):
+        file.release()
+    file.release()
+
+
 @pytest.mark.parametrize("folder", ["a file", "a file/below"])
 def test_a_cache_that_cannot_be_written_costs_a_warning(tmp_path, monkeypatch, folder):
     (tmp_path / "a file").write_text("")

@@ -43,6 +43,21 @@ def test_a_file_is_finished_by_the_views_for_validation_that_were_asked_for(tmp_
         assert finished(made) is not None and finished(other) is None
 
 
+@pytest.mark.usefixtures("small_orbits")
+@pytest.mark.parametrize(("scale", "cameras", "fits", "other"), [
+    (1 / 2, True, "pil-bicubic", "area"),
+    (1 / 16, True, "area", "pil-bicubic"),  # 2 px
+    (1 / 16, False, "area", "pil-bicubic"),
+    (2.0, True, "pil-bicubic", "lanczos"),
+])  # fmt: skip
+def test_only_a_filter_that_fits_is_finished(tmp_path, scale, cameras, fits, other):
+    job = job_of(tmp_path, recipe="default", scale=scale, overwrite=True)
+    job = job if cameras else replace(job, base=replace(job.base, cameras=None))
+    for resize in (fits, other):
+        assert run_job(replace(job, settings=job.settings | {"resize": resize})).status == "done"
+        assert (finished(job) is not None) == (resize == fits)
+
+
 def test_another_base_or_another_file_is_not_finished(tmp_path):
     job = job_of(tmp_path)
     run_job(job)
@@ -72,6 +87,15 @@ def test_other_cameras_background_or_photographs_are_not_finished(tmp_path):
     assert finished(job) is None
     write_cameras(tmp_path / "cameras.json", tiny.cameras(3), overwrite=True)
     assert finished(job) is not None
+
+
+def test_another_network_of_that_name_is_not_finished(tmp_path):
+    network = tmp_path / "net.pth"
+    network.write_bytes(b"one")
+    job = job_of(tmp_path, scale=2.0, settings={"steps": 0, "seed": 0, "views": "given", "upsampler": str(network)})
+    assert run_job(job).status == "done" and finished(job) is not None
+    network.write_bytes(b"other")
+    assert finished(job) is None
 
 
 @pytest.mark.usefixtures("small_orbits")

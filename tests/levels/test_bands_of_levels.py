@@ -21,7 +21,9 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.levels.ladder import make_levels
 from mipmap_plugin.levels.request import FINEST_RATIO, MERGING_COSTS, NARROW, STEPS_KEPT, WIDE, Band, LadderRequest
+from mipmap_plugin.levels.yardstick import Yardstick, shrunk
 from mipmap_plugin.recipes import recipe
+from mipmap_plugin.wrap import wrap_model
 
 pytestmark = pytest.mark.usefixtures("brief_ladders", "few_views")
 
@@ -78,6 +80,17 @@ def test_bands_meet_and_end_at_the_coarsest_scale():
     assert [band.scale for band in bands] == pytest.approx([1, 1 / 2, 1 / 4, 1 / 8, 0.08])
     assert all(finer.low == coarser.high for finer, coarser in pairwise(bands))
     assert all(band.low < band.scale <= band.high for band in bands)
+
+
+def test_levels_of_pictures_of_a_pixel_or_two_are_made_for_means_over_all_of_them_and_measured_so():
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(3, width=16, height=16))
+    asked, yardstick = LadderRequest.of("classic", steps=0, views="given"), Yardstick(base, 0)
+    band = Band(1 / 8, 1 / 8, 1 / 8, 2.0)
+    adapted = base.adapt(band.scale, **asked.arguments(band.settings()))
+    view, image = yardstick.example()
+    assert adapted.report.settings.resize == "area"
+    torch.testing.assert_close(shrunk(image, view.zoomed(1 / 8)), resize(image, (2, 2), "area"))
+    torch.testing.assert_close(shrunk(image, view.zoomed(1 / 4)), resize(image, (4, 4), "pil-bicubic"))
 
 
 def test_a_base_that_the_viewer_draws_as_its_training_did_stays_as_it_is():

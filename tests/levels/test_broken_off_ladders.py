@@ -1,5 +1,6 @@
 """What an interrupted, killed or failed ladder leaves, and which levels a later one goes on with."""
 
+import os
 import shutil
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ from mipmap_plugin import cli, wrap_model
 from mipmap_plugin.adaptation.optimization.run import Run
 from mipmap_plugin.errors import OutputError, SceneError, SettingsError
 from mipmap_plugin.evaluation.tradeoff.measuring import on_backend
+from mipmap_plugin.formats import staging
 from mipmap_plugin.levels.ladder import make_levels
 from mipmap_plugin.levels.request import FINEST_RATIO
 from mipmap_plugin.wrap import Interrupted
@@ -147,6 +149,17 @@ def test_what_a_ladder_that_was_killed_leaves_is_in_nobodys_way(tmp_path):
         (tmp_path / f".{left}" / "new").mkdir(parents=True)
     ladder = make_levels(wrapped(), request(coarsest=1.0), resume=tmp_path)
     assert {each.name for each in tmp_path.iterdir()} == {"request.json", "level_0.ply", "level_0.ply.adaptation.json"} and ladder.levels
+
+
+def test_levels_that_a_killed_ladder_was_deleting_are_in_nobodys_way(tmp_path, monkeypatch):
+    """They had no request any more, and were taken for other things."""
+    state, close = tmp_path / "state", staging.Staging.close
+    ladder = make_levels(wrapped(), request(coarsest=1.0), resume=state)
+    with monkeypatch.context() as patched:
+        patched.setattr(staging.Staging, "close", lambda self: os.close(self._lock) if (self.new / "state").exists() else close(self))
+        ladder.save(tmp_path / "ladder")
+    assert not state.exists() and (tmp_path / ".state.0.tmp").exists()
+    assert make_levels(wrapped(), request(coarsest=1.0), resume=state).levels and not (tmp_path / ".state.0.tmp").exists()
 
 
 def test_a_ladder_whose_first_level_has_a_state_keeps_it(tmp_path, monkeypatch):

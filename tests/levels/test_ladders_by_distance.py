@@ -55,6 +55,12 @@ def test_a_ladder_from_end_to_end(tmp_path, small_chunks, capsys):
     assert "3 levels by distance" in capsys.readouterr().out
 
 
+def test_levels_by_distance_have_the_filter_of_pictures_of_full_size(small_chunks):
+    base, request = wrapped(), LadderRequest.of("classic", by="distance", coarsest=1 / 64, ratio=4.0, **BRIEF)
+    scene = scene_of(base, request, request.first_band(base))
+    assert {scene.config(level).resize for level in range(1, scene.rule.count)} == {"pil-bicubic"}
+
+
 @pytest.mark.parametrize(
     ("db", "name"),
     [

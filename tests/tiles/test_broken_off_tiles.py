@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from unittest.mock import Mock
 
@@ -13,8 +14,10 @@ from cut_scenes import base_pictures
 from mipmap_plugin.adaptation.optimization.loop import adapt as real_adapt
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.errors import JobsFailed, OutputError, OutputExists, SceneError, SettingsError
+from mipmap_plugin.formats import staging
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.jobs.engines import in_this_process
+from mipmap_plugin.models.places import PLAN
 from mipmap_plugin.models.reading import load_vanilla
 from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.tiles import plan, run, steering, tile
@@ -36,7 +39,7 @@ def test_the_result_does_not_depend_on_what_was_done_before(job, monkeypatch):
         return real_adapt(run, *rest)
 
     monkeypatch.setattr(tile, "adapt", fail_once)
-    with pytest.raises(JobsFailed, match=r"1 of 3 jobs \(tile\) failed: no space left; the same command does these again"):
+    with pytest.raises(JobsFailed, match=r"1 of 3 jobs \(tile\) failed: no space left; check that path, .*; the same command does these again"):
         adapt_in_tiles(job, 3)
     outcomes = []
 
@@ -76,6 +79,16 @@ def test_tiles_of_another_request_are_not_touched(job):
 
 def failing(*_):
     raise OSError("no space left")
+
+
+def test_tiles_of_a_version_that_cut_across_sizes_are_refused(job):
+    """They ended in an error wherever a plane lay across an axis that is none."""
+    work_folder(job.target).mkdir()
+    plan.claim([job], 3)
+    file = work_folder(job.target) / PLAN
+    file.write_text(file.read_text().replace(f'"format": {plan.FORMAT}', '"format": 5'))
+    with pytest.raises(SettingsError, match="or of another version; repeat those, or delete it to start anew"):
+        adapt_in_tiles(job, 3)
 
 
 def test_tiles_are_not_gone_on_with_for_other_cameras(job, monkeypatch):
@@ -174,6 +187,18 @@ def test_a_scale_that_is_interrupted_leaves_the_others_what_they_share(job, monk
     first = next(adapt_all_in_tiles(jobs, 2))
     sizes = base_pictures(monkeypatch)
     assert first.file.exists() and adapt_in_tiles(jobs[1], 2).file.exists() and not sizes
+
+
+def test_a_run_that_is_killed_while_it_deletes_its_tiles_is_in_nobodys_way(job, monkeypatch):
+    """What was left of them had no plan, and was taken for other things."""
+    job = replace(job, settings=job.settings | {"steps": 0}, overwrite=True)
+    close = staging.Staging.close
+    with monkeypatch.context() as patched:
+        patched.setattr(staging.Staging, "close", lambda self: os.close(self._lock) if (self.new / "out.ply.tiles").exists() else close(self))
+        adapt_in_tiles(job, 2)
+    assert not work_folder(job.target).exists() and list(job.target.parent.glob(".out.ply.?.tmp"))
+    adapt_in_tiles(job, 2)
+    assert not list(job.target.parent.glob(".out.ply.?.tmp"))
 
 
 def test_no_folder_is_claimed_if_one_cannot_be(job):

@@ -8,7 +8,7 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.start.blend_weights import blend_weights
+from mipmap_plugin.adaptation.start.blend_weights import weighed
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import CheckpointError
@@ -154,8 +154,9 @@ def test_slabs_give_the_blend_weights_of_all_splats(on_disk, monkeypatch):
     splats, in_memory = on_disk
     views, backend = tiny.cameras(3), ReferenceBackend()
     monkeypatch.setattr(slabs, "COLORLESS_SLAB", 37)
-    expected = blend_weights(in_memory, views, backend, EFFECTS)
-    assert torch.allclose(Painter(backend, EFFECTS).blend_weights(splats, views), expected, atol=1e-3, rtol=1e-3)
+    expected, shown = weighed(in_memory, views, backend, EFFECTS)
+    found = Painter(backend, EFFECTS).weighed(splats, views)
+    assert torch.allclose(found[0], expected, atol=1e-3, rtol=1e-3) and found[1] == pytest.approx(shown)
 
 
 def test_strips_give_the_blend_weights_of_their_view(on_disk, monkeypatch):

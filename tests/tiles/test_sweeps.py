@@ -9,7 +9,12 @@ import tiny
 import torch
 from cut_scenes import config, cut_in_three
 
+from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS
 from mipmap_plugin.adaptation.views import ViewSchedule
+from mipmap_plugin.jobs.base import Base
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.screen_filters import DILATION
 from mipmap_plugin.tiles import steering
 from mipmap_plugin.tiles.run import adapt_in_tiles
@@ -45,6 +50,18 @@ def test_the_mildest_merging_may_cost_more_before_steps_for_another_renderer(job
     monkeypatch.setattr("mipmap_plugin.tiles.start.draws_alike", lambda *_: False)
     StartSearch(scene).run()
     assert torch.load(scene.folder / "start.pt")["name"] == name and not list(measured)
+
+
+def test_what_is_in_the_picture_but_not_seen_is_weighed_in_more_views(job):
+    """As without tiles, where twice as much of lego was merged: half of it is hidden in each view."""
+    splats = tiny.gaussians(80)
+    splats.opacities[::2] = 0.005
+    folder = job.base.checkpoint.with_name("pale")
+    VanillaModel.from_gaussians(splats, TrainedScale()).save(folder, provenance={})
+    write_cameras(folder / "cameras.json", tiny.cameras(30, width=20, height=16))
+    search = StartSearch(cut_in_three(replace(job, base=Base(folder))))
+    search.run()
+    assert len(search.views) == 2 * LEAST_VIEWS
 
 
 def test_without_a_closed_form_merged_splats_keep_their_opacities(job, monkeypatch):

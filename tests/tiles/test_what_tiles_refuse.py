@@ -12,7 +12,7 @@ import torch
 from cut_scenes import cut_in_three
 
 from mipmap_plugin.cli import main
-from mipmap_plugin.errors import CheckpointError, SettingsError
+from mipmap_plugin.errors import BackendUnavailable, CheckpointError, SettingsError
 from mipmap_plugin.formats.magic import SPLAT_RECORD
 from mipmap_plugin.formats.ply import read_ply, write_ply
 from mipmap_plugin.models import load_model
@@ -137,6 +137,14 @@ def test_views_that_show_nothing_are_refused_and_leave_no_folder(job):
     with pytest.raises(SettingsError, match="none of the 3 views shows a splat: the cameras seem to be of another scene"):
         adapt_in_tiles(replace(job, base=replace(job.base, cameras=folder / "cameras.json")), 2)
     assert not work_folder(job.target).exists()
+
+
+def test_what_is_refused_after_the_cut_leaves_no_folder(job):
+    views, backend = {"settings": job.settings | {"views": "test"}}, {"base": replace(job.base, backend="gsplat")}
+    for changes, told in ((views, "there are no test views among the 3 cameras"), (backend, "gsplat")):
+        with pytest.raises((SettingsError, BackendUnavailable), match=told):
+            adapt_in_tiles(replace(job, **changes), 2)
+        assert not work_folder(job.target).exists()
 
 
 def test_validation_views_that_show_nothing_do_not_count(job, monkeypatch):

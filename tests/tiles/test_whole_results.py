@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from contextlib import nullcontext
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -37,8 +36,7 @@ from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
 
 def test_a_scene_in_tiles_is_whole_and_better_than_its_base(job, monkeypatch):
     bodies = []
-    keep = SimpleNamespace(rmtree=lambda folder: bodies.extend((folder / f"part_{n}.ply").read_bytes() for n in range(3)))
-    monkeypatch.setattr(run, "shutil", keep)
+    monkeypatch.setattr(run, "delete", lambda folder, _: bodies.extend((folder / f"part_{n}.ply").read_bytes() for n in range(3)))
     joined = adapt_in_tiles(replace(job, settings=job.settings | {"merge_to": 0.6}), 3)
     report = joined.report
     assert len(load_vanilla(joined.file)) == report.gaussians_after == sum(tile["splats_after"] for tile in joined.tiles[-3:])
@@ -124,6 +122,12 @@ def test_no_tile_grows_beyond_what_the_settings_allow(job):
     assert 80 < adapt_in_tiles(replace(job, recipe="paper", settings=settings), 2).report.gaussians_after <= 96
 
 
+@pytest.mark.usefixtures("small_orbits")
+def test_tiles_without_cameras_have_the_filter_that_fits_generated_views(job):
+    job = replace(job, base=Base(tiny.ply(job.target.with_name("bare.ply"), count=80)), scale=1 / 16)  # of 24 px
+    assert adapt_in_tiles(replace(job, settings=job.settings | {"steps": 0}), 2).report.settings.resize == "area"
+
+
 # Several scales
 
 
@@ -184,6 +188,15 @@ def test_the_command_for_several_scales_skips_what_is_finished(job, capsys):
     assert main(["adapt", str(job.base.checkpoint), *options, "--scale", "1/4", "--json"]) == 0
     reports = json.loads(capsys.readouterr().out)
     assert [report["scale"] for report in reports] == [0.5, 0.25]
+
+
+def test_the_command_removes_the_lock_of_one_that_was_killed_at_a_further_scale(job):
+    """It held those of all its scales."""
+    options = ["--steps", "0", "--views", "given", "--tiles", "2", "--scale", "1/2", "--json"]
+    assert main(["adapt", str(job.base.checkpoint), *options]) == 0
+    lock = job.base.checkpoint.with_name(".scene_x0.5.tiles.lock")
+    lock.mkdir()
+    assert main(["adapt", str(job.base.checkpoint), *options, "--skip-existing"]) == 0 and not lock.exists()
 
 
 def test_the_command_says_how_to_go_on_with_several_scales(job, capsys, monkeypatch):

@@ -125,12 +125,10 @@ def _fewer(config: AdaptConfig, fraction: float) -> AdaptConfig:
 
 
 def as_taken(config: AdaptConfig, taken: AdaptConfig) -> AdaptConfig:
-    """What `affordable` and `fitting` make of the settings for the scene of which they made `taken`, if of the same settings.
+    """What `affordable` makes of the settings for the scene of which it made `taken`, if of the same settings.
 
     The fraction is known by the steps, which are rounded up, and so the extra views up to one or a few.
     """
-    if config.resize == "fitting":
-        config = config.model_copy(update={"resize": taken.resize})
     if config.most_draws is None or not LEAST_FRACTION * config.steps <= taken.steps < config.steps:
         return config
     least, most = (_fewer(config, steps / config.steps) for steps in (taken.steps - 1, taken.steps))

@@ -9,6 +9,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 
@@ -98,9 +99,13 @@ class Pace:
         return max(1, bisect_right(range(1, most + 1), SPARE * seconds, key=needed)) if follow.moments else most
 
 
-def for_upsampling(config: AdaptConfig, spent: float) -> float:
-    """Seconds that a network may take for a run's views: half of what a time budget has left after so many seconds, the rest being for steps."""
-    return math.inf if config.time_budget_s is None else (config.time_budget_s - spent) / 2
+def for_upsampling(config: AdaptConfig, spent: float, resume: Path | None) -> float:
+    """Seconds that a network may take for a run's views: half of what a time budget has left after so many seconds, the rest being for steps.
+
+    Of the whole budget where the run may go on from a state in `resume`, which has its own seconds: these are spent on a start that it has already.
+    """
+    goes_on = resume is not None and resume.exists()
+    return math.inf if config.time_budget_s is None else (config.time_budget_s - (0.0 if goes_on else spent)) / 2
 
 
 def most_of(config: AdaptConfig) -> int:

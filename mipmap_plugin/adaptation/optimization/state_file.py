@@ -25,10 +25,10 @@ class StateFile:
 
     def release(self) -> None:
         """Unlock the state, if there is one, for the next run."""
-        if self._lock is not None:
-            release(_lock_of(self.path), self._lock)
+        lock, self._lock = self._lock, None  # first, for Ctrl-C may break off what follows, and the lock is closed then
+        if lock is not None:
+            release(_lock_of(self.path), lock)
             remove_empty(self._made)
-            self._lock = None
 
     def __del__(self) -> None:
         self.release()

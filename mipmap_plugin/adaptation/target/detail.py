@@ -41,7 +41,7 @@ def unused_upsampler(config: AdaptConfig, scale: float) -> str | None:
     if config.upsampler == AdaptConfig.model_fields["upsampler"].default or (scale > 1 and config.steps and config.compare_at != "base"):
         return None
     instead = "; recipe paper uses it" if config.upsampler in INTERPOLATIONS else ""
-    taken = f"compare_at is {config.compare_at}{instead}" if config.steps else f"recipe {config.recipe} takes no steps"
+    taken = f"compare_at is {config.compare_at}{instead}" if config.steps else "no steps are taken"
     return f"the upsampler {config.upsampler} is not used, because {taken if scale > 1 else f'x{scale:g} is no zoom-in'}"
 
 

@@ -60,9 +60,14 @@ def fitting(config: AdaptConfig, base: Effects, views: Sequence[Camera], scale: 
     """
     if config.resize != "fitting":
         return config
-    narrow = max((min(view.zoomed(min(1.0, scale)).size) for view in views), default=math.inf) <= TOO_NARROW
-    averages = narrow or (scale > 1 and compensates(base.screen_filter))
-    return config.model_copy(update={"resize": "area" if averages else "pil-bicubic"})
+    width = max((min(view.zoomed(min(1.0, scale)).size) for view in views), default=math.inf)
+    averages = scale > 1 and compensates(base.screen_filter)
+    return config.model_copy(update={"resize": "area" if averages else filter_for(width)})
+
+
+def filter_for(width: float) -> str:
+    """The filter that makes an image smaller, to a picture whose shorter side has so many px."""
+    return "area" if width <= TOO_NARROW else "pil-bicubic"
 
 
 def difference_from(target: Tensor, image: Tensor, method: str) -> Tensor:

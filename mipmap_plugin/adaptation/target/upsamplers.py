@@ -12,6 +12,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.super_resolution import SUFFIXES, Network
 from mipmap_plugin.errors import PluginError, SettingsError, type_of
+from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.plugin_errors import is_third_party, naming
 from mipmap_plugin.registry import Registry
 
@@ -73,6 +74,12 @@ def check_upsampler(name: str) -> None:
         raise SettingsError(f"there is no upsampler {name!r}; choose from {', '.join(known)}, or give the file of a network ({', '.join(SUFFIXES)})")
     if not Path(name).is_file():
         raise SettingsError(f"there is no upsampler file {name}; check the path")
+
+
+def network_input(name: str) -> dict[str, str]:
+    """A hash of the network that an adaptation is given, if it is a file, as its provenance records it (`Report.inputs`); empty without one."""
+    is_file = name not in UPSAMPLERS.names() and Path(name).is_file()
+    return {"network": sha256(Path(name))} if is_file else {}
 
 
 def bicubic(image: Tensor, size: tuple[int, int]) -> Tensor:

@@ -74,7 +74,7 @@ class Scene:
     def config(self, level: int) -> AdaptConfig:
         """The settings of a level. Nothing is pruned, so that the rows of the finer level, which come first, keep their places."""
         config = affordable_for(self.asked(level), self.splats.means, self.views, self.target.near_plane)
-        config = fitting(config, self.base.effects(), self.views, self.scale(level))
+        config = fitting(config, self.base.effects(), self.views, 1.0)  # walks keep the size of their pictures
         return config.model_copy(update={"prune_every": max(1, config.steps)})
 
     def asked(self, level: int) -> AdaptConfig:
