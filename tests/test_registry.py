@@ -208,6 +208,23 @@ def test_what_is_wrong_with_the_first_of_two_packages_with_one_name_is_told_of_i
     assert facts_of("backends")["of packages"] == {"ours": f"{broken}; not used, as the name is the same: {__name__}:Fussy"}
 
 
+def test_a_plug_in_that_is_imported_leaves_torch_as_it_was(tmp_path, monkeypatch):
+    def state():
+        return torch.get_default_dtype(), torch.zeros(()).device, torch.is_grad_enabled(), torch.get_num_threads(), torch.get_rng_state().tolist()
+
+    sets = "set_default_dtype(torch.float64)", "set_default_device('meta')", "set_grad_enabled(False)", "set_num_threads(3)", "manual_seed(7)"
+    (tmp_path / "bossy_plugin.py").write_text("\n".join(["import torch", *(f"torch.{line}" for line in sets), "thing = torch.get_default_dtype()"]))
+    monkeypatch.syspath_prepend(tmp_path)
+    before = state()
+    assert load_target("bossy", "bossy_plugin:thing") == torch.float64
+    assert state() == before
+
+
+@pytest.mark.parametrize("target", ["mipmap_plugin.registry:Registry.names", "mipmap_plugin.registry:Registry.names [fast]"])
+def test_targets_are_written_as_those_of_entry_points(target):
+    assert load_target("names", target) is Registry.names
+
+
 def test_targets_are_imported_only_when_used(tmp_path, monkeypatch):
     (tmp_path / "lazy_plugin.py").write_text("thing = 'made'")
     monkeypatch.syspath_prepend(tmp_path)
