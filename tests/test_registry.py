@@ -123,6 +123,7 @@ def test_no_backend_at_all_gives_every_reason():
         ("no_such_package:Backend", "'bad' (no_such_package:Backend) cannot be loaded: ModuleNotFoundError: No module named 'no_such_package'"),
         ("mipmap_plugin.backends.reference:Missing", "cannot be loaded: AttributeError"),
         ("mipmap_plugin.backends.reference", "'bad' (mipmap_plugin.backends.reference) cannot be loaded; a target is written package.module:Name"),
+        (ReferenceBackend(), "backend 'bad' is of type ReferenceBackend; register its class, or a function that makes one"),
         (Crashing, "backend 'bad' cannot be created: RuntimeError: no driver"),
         (Ancient, f"backend 'bad' is written for API version {API_VERSION - 1}, but this package has API version {API_VERSION}"),
         (object, f"backend 'bad' is written for API version unknown, but this package has API version {API_VERSION}"),

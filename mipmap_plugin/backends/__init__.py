@@ -35,6 +35,8 @@ def register_backend(name: str, target: Any, *, replace: bool = False) -> None:
 def get_backend(name: str) -> Backend:
     """The backend `name`. Raises SettingsError if it is unknown, PluginError if it does not load or has another API version."""
     factory = BACKENDS.get(name)
+    if not callable(factory):  # most often a backend itself
+        raise PluginError(f"backend {name!r} is of type {type(factory).__name__}; register its class, or a function that makes one")
     try:
         backend: Backend = factory()
     except Exception as error:  # a third-party constructor may fail in any way; one broken plug-in must not break the others
