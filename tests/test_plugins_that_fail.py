@@ -157,6 +157,13 @@ def test_a_backend_that_fails_ends_a_command_in_a_sentence(tmp_path, capsys):
     assert not (tmp_path / "new.ply").exists()
 
 
+def test_a_failing_backend_that_nobody_asked_for_says_how_to_take_another():
+    backend(lambda rendered, _: 1 / 0, speed=99)
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(2))
+    with pytest.raises(PluginError, match=r"backend 'odd' \(taken as the fastest; another is taken by --backend NAME, or backend=\) failed: Zero"):
+        base.render(base.cameras[0])
+
+
 def test_what_is_wrapped_with_a_backend_of_ones_own_can_be_copied():
     base = backend(lambda rendered, _: rendered)
     before = base.adapt(0.5, recipe="instant")

@@ -90,6 +90,8 @@ def choose_backend(name: str, *needs: Needs) -> tuple[Backend, str]:
     best = _fastest(reasons_of)
     if best is None:
         raise BackendUnavailable("no backend can do this: " + " | ".join(f"{n}: {'; '.join(r)}" for n, r in reasons_of.items()))
+    if isinstance(best, Guarded):
+        best.unasked()
     _warn_of_numba(best.name, reasons_of.get("cpu", []))
     others = [f"{n} cannot: {r[0]}" for n, r in reasons_of.items() if r]
     return best, f"{best.name}: the fastest that can serve the request{_note_in_brackets(best)}" + "".join(f"; {reason}" for reason in others)

@@ -37,6 +37,10 @@ class Guarded:
         part = getattr(self.theirs, name)
         return partial(getattr(self, f"_{name}"), part) if name in OPTIONAL else part
 
+    def unasked(self) -> None:
+        """From now on messages say that nobody named this backend, and how to take another."""
+        self._title += " (taken as the fastest; another is taken by --backend NAME, or backend=)"
+
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         """See `base.Backend`."""
         watched = _watched(self._title, gaussians)
