@@ -11,7 +11,7 @@ import torch
 
 from mipmap_plugin.backends.base import API_VERSION, Backend, Needs
 from mipmap_plugin.backends.guarded import Guarded
-from mipmap_plugin.errors import BackendUnavailable, PluginError, type_of
+from mipmap_plugin.errors import BackendUnavailable, PluginError, SettingsError, type_of
 from mipmap_plugin.plugin_errors import is_third_party
 from mipmap_plugin.registry import Registry
 
@@ -28,7 +28,9 @@ BACKENDS = Registry(
 
 
 def register_backend(name: str, target: Any, *, replace: bool = False) -> None:
-    """Register a backend under `name`: a class, or `"package.module:Class"`, which is imported at first use."""
+    """Register a backend under `name`: a class, or `"package.module:Class"`, which is imported at first use. Raises SettingsError."""
+    if name == "auto":
+        raise SettingsError("a backend cannot be named 'auto', which stands for the fastest one; choose another name")
     BACKENDS.add(name, target, replace=replace)
 
 
