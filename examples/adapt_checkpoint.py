@@ -6,18 +6,20 @@
 from __future__ import annotations
 
 import sys
-from fractions import Fraction
 from pathlib import Path
 
-from mipmap_plugin import wrap_model
+import tyro
+
+from mipmap_plugin import MipmapPluginError, wrap_model
+from mipmap_plugin.commands.types import Scale
 from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.models.adapted_name import adapted_name
 
 
-def main(path: str, scale: float) -> None:
+def main(path: tyro.conf.Positional[Path], scale: tyro.conf.Positional[Scale]) -> None:
     model = wrap_model(path)
     adapted = model.adapt(scale)
-    print(adapted.save(Path(path).with_name(adapted_name(Path(path), scale))))
+    print(adapted.save(path.with_name(adapted_name(path, scale))))
 
     camera = model.views()[0].zoomed(scale)
     write_image("before.png", model.render(camera, scale).image, overwrite=True)
@@ -25,4 +27,8 @@ def main(path: str, scale: float) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], float(Fraction(sys.argv[2])))
+    try:
+        tyro.cli(main)
+    except MipmapPluginError as error:  # whose text says what is wrong, and what to do
+        print(error, file=sys.stderr)
+        sys.exit(2)

@@ -1,6 +1,6 @@
 """Register your own family of checkpoints; here: splats in a NumPy archive, whose adapted files are PLYs.
 
-    python examples/register_family.py scene.npz 1/4
+    python examples/register_family.py scene.npz --scale 1/4
 
 A package registers it without any call, by an entry point in its pyproject.toml:
 
@@ -13,13 +13,13 @@ and tests it with mipmap_plugin.models.conformance.ModelSuite, as its backends w
 from __future__ import annotations
 
 import sys
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from mipmap_plugin import register_model, wrap_model
+from mipmap_plugin import register_model
+from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.models import CERTAIN, Family, Files, Match
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
@@ -43,4 +43,4 @@ FAMILY = Family("npz", "splats in a NumPy archive", recognize, api_version=1, lo
 
 if __name__ == "__main__":
     register_model("npz", FAMILY)
-    print(wrap_model(sys.argv[1]).adapt(float(Fraction(sys.argv[2]))).save("adapted.ply"))
+    sys.exit(main(["adapt", *sys.argv[1:]]))  # the command, which knows it now

@@ -1,6 +1,6 @@
 """Register a family that stores splats in a way of its own, and saves them so; here: means, Cholesky factors of covariances, opacities and RGB.
 
-    python examples/register_family_files.py scene.npz 1/4
+    python examples/register_family_files.py scene.npz --scale 1/4
 
 Its parameters, in memory, are those of 3DGS: so its splats can be merged, optimized and written as a PLY for viewers. A family that cannot be
 told so is a class with the methods of `mipmap_plugin.models.SplatModel`.
@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import json
 import sys
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from mipmap_plugin import Gaussians, register_model, wrap_model
+from mipmap_plugin import Gaussians, register_model
+from mipmap_plugin.cli import main
 from mipmap_plugin.formats.atomic import new_file, refuse_output, sha256
 from mipmap_plugin.models import API_VERSION, CERTAIN, Family, Files, Match
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
@@ -67,4 +67,4 @@ FAMILY = Family("cholesky", "splats as Cholesky factors", recognize, API_VERSION
 
 if __name__ == "__main__":
     register_model("cholesky", FAMILY)
-    print(wrap_model(sys.argv[1]).adapt(float(Fraction(sys.argv[2]))).save("adapted.npz"))
+    sys.exit(main(["adapt", *sys.argv[1:]]))  # the command, which knows it now

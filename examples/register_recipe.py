@@ -1,6 +1,6 @@
 """Register a recipe of your own; here: half of the steps of `default`, and slower changes of view-dependent colors.
 
-    python examples/register_recipe.py output/bicycle 1/4
+    python examples/register_recipe.py output/bicycle --scale 1/4
 
 A package registers it without any call, by an entry point in its pyproject.toml:
 
@@ -13,10 +13,10 @@ and `mipmap-plugin adapt output/bicycle --scale 1/4 --recipe brief` uses it.
 from __future__ import annotations
 
 import sys
-from fractions import Fraction
 from typing import Any
 
-from mipmap_plugin import register_recipe, wrap_model
+from mipmap_plugin import register_recipe
+from mipmap_plugin.cli import main
 from mipmap_plugin.recipes import default
 
 
@@ -28,4 +28,4 @@ def brief(scale: float, network: bool) -> dict[str, Any]:
 
 if __name__ == "__main__":
     register_recipe("brief", brief)
-    print(wrap_model(sys.argv[1]).adapt(float(Fraction(sys.argv[2])), recipe="brief").save("brief.ply"))
+    sys.exit(main(["adapt", *sys.argv[1:], "--recipe", "brief", "--output", "brief.ply"]))  # the command, which knows it now

@@ -1,6 +1,6 @@
 """Register your own upsampler, to adapt a zoom-in to its images; here: Lanczos with unsharp masking.
 
-    python examples/register_upsampler.py output/bicycle 2
+    python examples/register_upsampler.py output/bicycle --scale 2
 
 A package registers it without any call, by an entry point in its pyproject.toml:
 
@@ -13,12 +13,12 @@ and `mipmap-plugin adapt output/bicycle --scale 2 --upsampler sharp` uses it.
 from __future__ import annotations
 
 import sys
-from fractions import Fraction
 
 from torch import Tensor
 
-from mipmap_plugin import register_upsampler, wrap_model
+from mipmap_plugin import register_upsampler
 from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.cli import main
 
 
 def sharp(image: Tensor, size: tuple[int, int]) -> Tensor:
@@ -30,4 +30,4 @@ def sharp(image: Tensor, size: tuple[int, int]) -> Tensor:
 
 if __name__ == "__main__":
     register_upsampler("sharp", sharp)
-    print(wrap_model(sys.argv[1]).adapt(float(Fraction(sys.argv[2])), upsampler="sharp").save("sharp.ply"))
+    sys.exit(main(["adapt", *sys.argv[1:], "--upsampler", "sharp", "--output", "sharp.ply"]))  # the command, which knows it now

@@ -1,6 +1,6 @@
 """Register the viewer that you use, to adapt files for it: one record.
 
-    python examples/register_viewer.py output/bicycle 1/4
+    python examples/register_viewer.py output/bicycle --scale 1/4
 
 A package registers it without any call, by an entry point in its pyproject.toml:
 
@@ -13,9 +13,9 @@ and `mipmap-plugin adapt output/bicycle --scale 1/4 --viewer kiosk` makes a file
 from __future__ import annotations
 
 import sys
-from fractions import Fraction
 
-from mipmap_plugin import register_viewer, wrap_model
+from mipmap_plugin import register_viewer
+from mipmap_plugin.cli import main
 from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.splatting.viewers import Viewer
 
@@ -25,4 +25,4 @@ KIOSK = Viewer(
 
 if __name__ == "__main__":
     register_viewer("kiosk", KIOSK)
-    print(wrap_model(sys.argv[1]).adapt(float(Fraction(sys.argv[2])), viewer="kiosk").save("kiosk.ply"))
+    sys.exit(main(["adapt", *sys.argv[1:], "--viewer", "kiosk", "--output", "kiosk.ply"]))  # the command, which knows it now

@@ -7,6 +7,7 @@ writes a 3DGS model folder. It needs no data: the truth is ray-traced. It takes 
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import torch
@@ -22,7 +23,9 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig, LearningRates
 from mipmap_plugin.demo.world import cameras, render_world, surface_points
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import MipmapPluginError, SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.formats.atomic import refuse_output
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
@@ -81,6 +84,9 @@ def main(
         splats: Splats to end with; 12,000 of SH degree 2 fill 2 MB.
         steps: Optimizer steps in all; densification ends after a third of them.
     """
+    if min(size, splats, steps) < 1 or views < 7 or points < 4:
+        raise SettingsError("size, splats and steps have to be 1 or more, views 7, and points 4")
+    refuse_output(output, overwrite=False)  # before the minutes that it takes
     # One test view to seven for training: with `eval`, readers of cameras.json take the first eighth for testing.
     train_views, test_views = cameras(size, views, "train"), cameras(size, views // 7, "test")
     truth = {view: render_world(view, samples=16) for view in tqdm(train_views, desc="ray-tracing", disable=None)}
@@ -103,4 +109,8 @@ def quality(model: VanillaModel, views: list[Camera]) -> float:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    try:
+        tyro.cli(main)
+    except MipmapPluginError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)

@@ -7,8 +7,10 @@ import contextlib
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import wraps
 from importlib.metadata import version
+from typing import Any
 
 import tyro
 
@@ -37,9 +39,21 @@ DESCRIPTION = (
 
 COMMANDS = {command.__name__.rstrip("_"): command for command in (inspect, adapt, levels, render, view, evaluate, tradeoff, backends, list_, demo)}
 
+
+def _alone(command: Callable[..., None]) -> Callable[..., None]:
+    """The command, while which nothing else prints to standard output (`voice.alone`); its help, which tyro prints, comes before."""
+
+    @wraps(command)
+    def run(*args: Any, **kwargs: Any) -> None:
+        with voice.alone():
+            command(*args, **kwargs)
+
+    return run
+
+
 app = tyro.extras.SubcommandApp()
 for name, command in COMMANDS.items():
-    app.command(name=name)(command)
+    app.command(name=name)(_alone(command))
 
 
 def _at_home(word: str) -> str:

@@ -123,9 +123,12 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
     if not callable(function):
         raise PluginError(f"recipe {name!r} is of type {type(function).__name__}; make it a function (scale, network) -> settings")
     try:
-        settings = {**function(scale, str(overrides.get("upsampler", "bicubic")) not in INTERPOLATIONS)}
+        made = function(scale, str(overrides.get("upsampler", "bicubic")) not in INTERPOLATIONS)
     except (Exception, SystemExit) as error:  # third-party code may fail in any way
         raise PluginError(f"recipe {name!r} failed at x{scale:g}: {type(error).__name__}: {error}") from error
+    if not isinstance(made, Mapping):
+        raise PluginError(f"recipe {name!r} has to return a dict of settings; at x{scale:g} it returned {type_of(made)}")
+    settings = {**made}
     if any(overrides.get(end) is not None for end in ENDS):
         settings |= {"most_draws": None, "least_zoom_in": 1.0}
     if overrides.get("steps") is not None:

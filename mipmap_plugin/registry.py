@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import operator
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -95,12 +96,22 @@ def _modified(folder: str) -> float:
         return 0.0
 
 
+def _imported(module: str) -> Any:
+    """The module. One of another package leaves torch as it was, even if it sets it up for itself; torch is imported for that."""
+    if module.partition(".")[0] == __name__.partition(".")[0]:
+        return importlib.import_module(module)
+    from mipmap_plugin.process.torch_modes import settings_kept
+
+    with settings_kept():
+        return importlib.import_module(module)
+
+
 def load_target(name: str, target: str) -> Any:
-    """Import `"package.module:Name"`. Raises PluginError."""
-    module, colon, attribute = target.partition(":")
+    """Import `"package.module:Name"`; as in entry points, a name may have dots, and extras in brackets, which do not count. Raises PluginError."""
+    module, colon, attribute = target.partition("[")[0].rstrip().partition(":")
     if not colon:
         raise PluginError(f"{name!r} ({target}) cannot be loaded; a target is written package.module:Name")
     try:
-        return getattr(importlib.import_module(module), attribute)
+        return operator.attrgetter(attribute)(_imported(module))
     except (Exception, SystemExit) as error:  # a third-party module may fail in any way; one broken plug-in must not break the others
         raise PluginError(f"{name!r} ({target}) cannot be loaded: {type(error).__name__}: {error}") from error

@@ -1,6 +1,8 @@
 """What the examples bring, as a package would that is installed beside this one: by entry points alone, in the commands."""
 
+import re
 import runpy
+import sys
 from functools import partialmethod
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -16,6 +18,7 @@ from mipmap_plugin.wrap import Wrapped
 pytestmark = pytest.mark.usefixtures("few_views")
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+SCRIPTS = ["adapt_checkpoint.py", *sorted(file.name for file in EXAMPLES.glob("register_*.py") if file.name != "register_backend.py")]
 POINTS = [
     EntryPoint("careful", "register_backend:CarefulBackend", "mipmap_plugin.backends"),
     EntryPoint("npz", "register_family:FAMILY", "mipmap_plugin.models"),
@@ -58,6 +61,16 @@ def test_the_commands_that_list_know_of_it(scene, capsys):
     assert all(f"{point.name}: {point.value}\n" in listed for point in POINTS)
 
 
+def test_a_group_of_entry_points_that_is_misspelled_is_told(tmp_path, monkeypatch, capsys):
+    (tmp_path / "stranger-1.0.dist-info").mkdir()
+    (tmp_path / "stranger-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1.0\n")
+    (tmp_path / "stranger-1.0.dist-info" / "entry_points.txt").write_text("[mipmap_plugin.backend]\nmine = stranger:Mine\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert cli.main(["list"]) == 0
+    told = "mine (stranger:Mine), in the group mipmap_plugin.backend of entry points, is not used: the groups are mipmap_plugin.backends,"
+    assert told in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("module", ["register_family", "register_family_files"])
 def test_cameras_beside_a_file_of_the_example_are_found(scene, tmp_path, module):
     load = runpy.run_path(str(EXAMPLES / f"{module}.py"))
@@ -79,7 +92,7 @@ def test_the_adapted_checkpoint_lies_beside_its_base(tmp_path, monkeypatch, name
     monkeypatch.chdir(tmp_path)
     tiny.model().save(tmp_path / name, provenance={})
     monkeypatch.setattr(Wrapped, "adapt", partialmethod(Wrapped.adapt, steps=1))
-    runpy.run_path(str(EXAMPLES / "adapt_checkpoint.py"))["main"](name, 0.5)
+    runpy.run_path(str(EXAMPLES / "adapt_checkpoint.py"))["main"](Path(name), 0.5)
     assert (tmp_path / made).is_file() and (tmp_path / "after.png").is_file()
 
 
@@ -87,6 +100,23 @@ def test_the_demo_scene_can_be_trained(tmp_path):
     train = runpy.run_path(str(EXAMPLES / "train_demo_scene.py"))["main"]
     train(tmp_path / "demo", size=16, views=7, points=40, splats=30, steps=4)
     assert len(load_model(tmp_path / "demo")) <= 30
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_script_ends_in_one_sentence_where_there_is_no_checkpoint(script, monkeypatch, capsys):
+    words = ["1/4"] if script == "adapt_checkpoint.py" else ["--scale", "1/4"]
+    monkeypatch.setattr(sys, "argv", [script, "nosuch", *words])
+    with pytest.raises(SystemExit, match=r"^2$"):
+        runpy.run_path(str(EXAMPLES / script), run_name="__main__")
+    assert re.fullmatch(r"(mipmap-plugin: )?nosuch does not exist; give a PLY file or a model folder\n", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(("words", "said"), [(["--views", "3"], "views 7, and points 4"), ([], "exists already")])
+def test_what_the_demo_scene_cannot_be_trained_with_is_told_at_once(tmp_path, monkeypatch, capsys, words, said):
+    monkeypatch.setattr(sys, "argv", ["train_demo_scene.py", str(tmp_path), *words])
+    with pytest.raises(SystemExit, match=r"^2$"):
+        runpy.run_path(str(EXAMPLES / "train_demo_scene.py"), run_name="__main__")
+    assert said in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("register_*.py")), ids=lambda file: file.stem)

@@ -6,11 +6,11 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin import register_model, wrap_model
+from mipmap_plugin import load_model, register_model, wrap_model
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.errors import OutputExists, PluginError
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models import API_VERSION, Family, detect
+from mipmap_plugin.models import API_VERSION, CERTAIN, Family, Match, detect
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.plugin_errors import naming_any
 from mipmap_plugin.splatting.rotations import rotations
@@ -161,6 +161,13 @@ def test_a_family_that_ignores_what_is_there_replaces_nothing(tmp_path):
 def test_an_error_of_this_package_stays_what_it_is():
     with pytest.raises(ZeroDivisionError), naming_any({"backend 'odd'": ReferenceBackend()}):
         1 / 0  # noqa: B018
+
+
+@pytest.mark.parametrize(("loaded", "said"), [(None, "a NoneType"), (tiny.gaussians(4), "a Gaussians"), ({"means": torch.zeros(3, 3)}, "a dict")])
+def test_a_loader_that_returns_no_model_is_told_what_to_return(tmp_path, loaded, said):
+    register_model("theirs", Family("theirs", "Theirs", lambda files: Match(CERTAIN, "all"), API_VERSION, lambda path, *, iteration=None: loaded))
+    with pytest.raises(PluginError, match=f"family 'theirs': its load has to return an object with .*; it returned {said}$"):
+        load_model(tiny.ply(tmp_path / "a.ply"))
 
 
 def damaged(files):

@@ -66,6 +66,8 @@ def test_a_backend_by_itself_may_draw_in_inference_mode():
         (lambda rendered, _: sys.exit(0), "backend 'odd' failed: SystemExit: 0"),
         (lambda rendered, _: rendered.replaced(image=rendered.image * torch.nan), "backend 'odd' returned an image with NaN or infinity"),
         (lambda rendered, _: rendered.replaced(image=rendered.image.double()), "images of the splats' type torch.float32; it returned torch.float64"),
+        (lambda rendered, _: rendered.replaced(image=rendered.image.to("meta")), "images on the splats' device cpu; it returned one on meta"),
+        (lambda rendered, _: rendered.replaced(image=255 * rendered.image), r"returned colors up to \d+, where .*; return 0..1, not 0..255"),
         (in_place, r"backend 'odd' changed its input in place \(means\)"),
     ],
 )
@@ -103,10 +105,18 @@ def test_an_image_of_nothing_may_come_without_gradients():
     assert summary(outcomes) == "2 cases: 2 run, 0 skipped, 0 failed"
 
 
-@pytest.mark.parametrize("alpha", [None, torch.zeros(3, 3)])
-def test_a_wrong_alpha_of_a_backend_is_told_by_its_name(alpha):
+@pytest.mark.parametrize(
+    ("alpha", "said"),
+    [
+        (None, r"\[48, 64\]; it returned a NoneType"),
+        (torch.zeros(3, 3), r"\[48, 64\]; it returned \[3, 3\]"),
+        (torch.zeros(48, 64, dtype=torch.float64), "in torch.float32 on cpu, as the image; it returned one in torch.float64 on cpu"),
+        (torch.zeros(48, 64, device="meta"), "in torch.float32 on cpu, as the image; it returned one in torch.float32 on meta"),
+    ],
+)
+def test_a_wrong_alpha_of_a_backend_is_told_by_its_name(alpha, said):
     base = backend(lambda rendered, _: Rendered(rendered.image, alpha))
-    with pytest.raises(PluginError, match=r"backend 'odd' has to return an alpha \[48, 64\]"):
+    with pytest.raises(PluginError, match=f"backend 'odd' has to return an alpha {said}"):
         base.render(base.cameras[0], supersampling=2)
 
 
@@ -147,6 +157,13 @@ def test_a_backend_that_fails_ends_a_command_in_a_sentence(tmp_path, capsys):
     assert not (tmp_path / "new.ply").exists()
 
 
+def test_a_failing_backend_that_nobody_asked_for_says_how_to_take_another():
+    backend(lambda rendered, _: 1 / 0, speed=99)
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(2))
+    with pytest.raises(PluginError, match=r"backend 'odd' \(taken as the fastest; another is taken by --backend NAME, or backend=\) failed: Zero"):
+        base.render(base.cameras[0])
+
+
 def test_what_is_wrapped_with_a_backend_of_ones_own_can_be_copied():
     base = backend(lambda rendered, _: rendered)
     before = base.adapt(0.5, recipe="instant")
@@ -159,6 +176,7 @@ def test_what_is_wrapped_with_a_backend_of_ones_own_can_be_copied():
     [
         (lambda image, size: 255 * resize(image, size, "lanczos"), "whose colors are 0..1; those that it returned are"),
         (lambda image, size: (255 * resize(image, size, "lanczos")).byte(), "in torch.uint8"),
+        (lambda image, size: resize(image, size, "lanczos").to("meta"), "on cpu, where it got one; it returned one on meta"),
         (lambda image, size: sys.exit(0), "upsampler 'odd' failed: SystemExit"),
     ],
 )

@@ -69,9 +69,9 @@ def test_the_command_does_not_draw_as_several(tmp_path, capsys):
 
 
 def test_a_group_is_made_of_names():
-    for wrong in ((), (find_viewer("spark"),)):
+    for wrong in ((), (find_viewer("spark"),), ("spark", "nobody")):
         register_viewer("wrong", wrong, replace=True)
-        with pytest.raises(PluginError, match="must contain names of registered viewers"):
+        with pytest.raises(PluginError, match="viewer group 'wrong' must contain names of registered viewers"):
             viewers_for("wrong")
 
 

@@ -123,6 +123,7 @@ def test_no_backend_at_all_gives_every_reason():
         ("no_such_package:Backend", "'bad' (no_such_package:Backend) cannot be loaded: ModuleNotFoundError: No module named 'no_such_package'"),
         ("mipmap_plugin.backends.reference:Missing", "cannot be loaded: AttributeError"),
         ("mipmap_plugin.backends.reference", "'bad' (mipmap_plugin.backends.reference) cannot be loaded; a target is written package.module:Name"),
+        (ReferenceBackend(), "backend 'bad' is of type ReferenceBackend; register its class, or a function that makes one"),
         (Crashing, "backend 'bad' cannot be created: RuntimeError: no driver"),
         (Ancient, f"backend 'bad' is written for API version {API_VERSION - 1}, but this package has API version {API_VERSION}"),
         (object, f"backend 'bad' is written for API version unknown, but this package has API version {API_VERSION}"),
@@ -206,6 +207,23 @@ def test_what_is_wrong_with_the_first_of_two_packages_with_one_name_is_told_of_i
     monkeypatch.setattr(registry, "entry_points", lambda group: points)
     broken = f"{__name__}:Crashing, not used: backend 'ours' cannot be created: RuntimeError: no driver"
     assert facts_of("backends")["of packages"] == {"ours": f"{broken}; not used, as the name is the same: {__name__}:Fussy"}
+
+
+def test_a_plug_in_that_is_imported_leaves_torch_as_it_was(tmp_path, monkeypatch):
+    def state():
+        return torch.get_default_dtype(), torch.zeros(()).device, torch.is_grad_enabled(), torch.get_num_threads(), torch.get_rng_state().tolist()
+
+    sets = "set_default_dtype(torch.float64)", "set_default_device('meta')", "set_grad_enabled(False)", "set_num_threads(3)", "manual_seed(7)"
+    (tmp_path / "bossy_plugin.py").write_text("\n".join(["import torch", *(f"torch.{line}" for line in sets), "thing = torch.get_default_dtype()"]))
+    monkeypatch.syspath_prepend(tmp_path)
+    before = state()
+    assert load_target("bossy", "bossy_plugin:thing") == torch.float64
+    assert state() == before
+
+
+@pytest.mark.parametrize("target", ["mipmap_plugin.registry:Registry.names", "mipmap_plugin.registry:Registry.names [fast]"])
+def test_targets_are_written_as_those_of_entry_points(target):
+    assert load_target("names", target) is Registry.names
 
 
 def test_targets_are_imported_only_when_used(tmp_path, monkeypatch):

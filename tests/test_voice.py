@@ -1,6 +1,7 @@
 """What commands say: quiet or not, and in a log."""
 
 import contextlib
+import json
 import os
 import re
 import shlex
@@ -15,6 +16,7 @@ from mipmap_plugin import progress
 from mipmap_plugin.cli import main
 from mipmap_plugin.commands.voice import options, say, speaking, wrapped
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.models.families import API_VERSION, FAMILIES, Family
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
@@ -72,6 +74,14 @@ def test_wrapping_loses_no_word(width):
 def test_a_quiet_command_prints_json(base, capsys):
     assert main(["--quiet", "inspect", base, "--json"]) == 0
     assert capsys.readouterr().out.startswith("{")
+
+
+def test_what_a_plug_in_prints_is_no_part_of_the_json(base, capsys):
+    family = Family("chatty", "Prints", lambda files: print("is it mine?"), API_VERSION)
+    with FAMILIES.temporarily(chatty=family):
+        assert main(["inspect", base, "--no-viewers", "--json"]) == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out)["family"] and "is it mine?" in said.err
 
 
 def test_a_quiet_command_prints_what_is_wrong(base, capsys):

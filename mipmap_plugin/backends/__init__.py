@@ -11,7 +11,7 @@ import torch
 
 from mipmap_plugin.backends.base import API_VERSION, Backend, Needs
 from mipmap_plugin.backends.guarded import Guarded
-from mipmap_plugin.errors import BackendUnavailable, PluginError, type_of
+from mipmap_plugin.errors import BackendUnavailable, PluginError, SettingsError, type_of
 from mipmap_plugin.plugin_errors import is_third_party
 from mipmap_plugin.registry import Registry
 
@@ -28,13 +28,17 @@ BACKENDS = Registry(
 
 
 def register_backend(name: str, target: Any, *, replace: bool = False) -> None:
-    """Register a backend under `name`: a class, or `"package.module:Class"`, which is imported at first use."""
+    """Register a backend under `name`: a class, or `"package.module:Class"`, which is imported at first use. Raises SettingsError."""
+    if name == "auto":
+        raise SettingsError("a backend cannot be named 'auto', which stands for the fastest one; choose another name")
     BACKENDS.add(name, target, replace=replace)
 
 
 def get_backend(name: str) -> Backend:
     """The backend `name`. Raises SettingsError if it is unknown, PluginError if it does not load or has another API version."""
     factory = BACKENDS.get(name)
+    if not callable(factory):  # most often a backend itself
+        raise PluginError(f"backend {name!r} is of type {type(factory).__name__}; register its class, or a function that makes one")
     try:
         backend: Backend = factory()
     except Exception as error:  # a third-party constructor may fail in any way; one broken plug-in must not break the others
@@ -88,6 +92,8 @@ def choose_backend(name: str, *needs: Needs) -> tuple[Backend, str]:
     best = _fastest(reasons_of)
     if best is None:
         raise BackendUnavailable("no backend can do this: " + " | ".join(f"{n}: {'; '.join(r)}" for n, r in reasons_of.items()))
+    if isinstance(best, Guarded):
+        best.unasked()
     _warn_of_numba(best.name, reasons_of.get("cpu", []))
     others = [f"{n} cannot: {r[0]}" for n, r in reasons_of.items() if r]
     return best, f"{best.name}: the fastest that can serve the request{_note_in_brackets(best)}" + "".join(f"; {reason}" for reason in others)

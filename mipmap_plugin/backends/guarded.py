@@ -20,6 +20,9 @@ from mipmap_plugin.plugin_errors import naming, unchanged
 # What a backend may have beside `lacking` and `render`.
 OPTIONAL = ("render_views", "blend_weights", "weigh_views", "stepper", "compile_ahead")
 
+# Beyond so much, and beyond so many times the brightest splat, an image has colors of another range.
+BRIGHT = 4.0
+
 
 class Guarded:
     """A backend whose images, gradients and weights are looked at. Raises PluginError for what is not as `backends.base` says."""
@@ -33,6 +36,10 @@ class Guarded:
             raise AttributeError(name)
         part = getattr(self.theirs, name)
         return partial(getattr(self, f"_{name}"), part) if name in OPTIONAL else part
+
+    def unasked(self) -> None:
+        """From now on messages say that nobody named this backend, and how to take another."""
+        self._title += " (taken as the fastest; another is taken by --backend NAME, or backend=)"
 
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         """See `base.Backend`."""
@@ -49,10 +56,23 @@ class Guarded:
             raise PluginError(f"{self._title} has to return a Rendered with an image {list(wanted)}; it returned {got}")
         if image.dtype != gaussians.means.dtype:
             raise PluginError(f"{self._title} has to return images of the splats' type {gaussians.means.dtype}; it returned {image.dtype}")
+        if image.device != gaussians.means.device:
+            raise PluginError(f"{self._title} has to return images on the splats' device {gaussians.means.device}; it returned one on {image.device}")
         if not image.isfinite().all():
             view = f"{camera.name or 'a view'}, {camera.width} x {camera.height} px"
             raise PluginError(f"{self._title} returned an image with NaN or infinity, of {view}")
-        return rendered.replaced(image=self._joined(image, gaussians, effects), alpha=partial(self._alpha, rendered, wanted[:2]))
+        self._check_colors(image.detach(), gaussians, effects)
+        return rendered.replaced(image=self._joined(image, gaussians, effects), alpha=partial(self._alpha, rendered, image))
+
+    def _check_colors(self, image: Tensor, gaussians: Gaussians, effects: Effects) -> None:
+        """Raise PluginError for colors far beyond those of the splats and the background, between which blending stays: of 0..255, for example."""
+        largest = float(image.amax())
+        if largest <= BRIGHT:  # as most images; to look at all splats takes a moment
+            return
+        most = max(*effects.background, 0.5 + float(gaussians.sh.detach().abs().sum(1).amax()) if len(gaussians) else 0.0)
+        if largest > BRIGHT * most:
+            own = f"those of the splats and the background are {most:.3g} at most"
+            raise PluginError(f"{self._title} returned colors up to {largest:.3g}, where {own}; return 0..1, not 0..255")
 
     def _joined(self, image: Tensor, gaussians: Gaussians, effects: Effects) -> Tensor:
         """The image as a part of the gradient graph: one of nothing may come without gradients, which are 0. Raises PluginError for any other."""
@@ -63,12 +83,16 @@ class Guarded:
             raise PluginError(f"{self._title} returned an image without gradients, and does not say in `lacking` that it has none")
         return image + differentiable[0][:0].sum()
 
-    def _alpha(self, rendered: Rendered, wanted: tuple[int, ...]) -> Tensor:
+    def _alpha(self, rendered: Rendered, image: Tensor) -> Tensor:
         with naming(self._title):
             alpha = rendered.alpha
-        if not isinstance(alpha, Tensor) or tuple(alpha.shape) != wanted:
+        wanted = image.shape[:2]
+        if not isinstance(alpha, Tensor) or alpha.shape != wanted:
             got = list(alpha.shape) if isinstance(alpha, Tensor) else type_of(alpha)
             raise PluginError(f"{self._title} has to return an alpha {list(wanted)}; it returned {got}")
+        if (alpha.dtype, alpha.device) != (image.dtype, image.device):
+            likewise = f"in {image.dtype} on {image.device}, as the image"
+            raise PluginError(f"{self._title} has to return an alpha {likewise}; it returned one in {alpha.dtype} on {alpha.device}")
         return alpha
 
     def _render_views(self, theirs: Any, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import base_cameras, print_facts, print_json
 from mipmap_plugin.commands.types import Cameras, Checkpoint, ScreenFilter, Up
+from mipmap_plugin.errors import PluginError
 from mipmap_plugin.jobs.base import COLORS
 from mipmap_plugin.process.garbage import uncollected
 from mipmap_plugin.progress import announced
@@ -54,11 +55,19 @@ def inspect(
     if not json:
         print_facts(facts)  # before pictures are drawn, which takes longer
     with announced("drawing as viewers do"):
-        from mipmap_plugin.evaluation.viewer_differences import viewer_differences
-
-        differences = viewer_differences(wrapped) if viewers else "not requested"
+        differences = _differences(wrapped) if viewers else "not requested"
     last = {"viewers": differences, "notes": [note for note in model.notes if note not in [*facts["health"], *asked]]}
     print_json(known | facts | last) if json else print_facts(last)
+
+
+def _differences(wrapped: Wrapped) -> str:
+    """`viewer_differences`, or that the backend failed: nobody asked for it here, and the checkpoint may be sound."""
+    from mipmap_plugin.evaluation.viewer_differences import viewer_differences
+
+    try:
+        return viewer_differences(wrapped)
+    except PluginError as error:
+        return f"not drawn: {error}"
 
 
 def _facts(checkpoint: Path, wrapped: Wrapped, given: Path | None, *, whole: bool) -> dict[str, Any]:

@@ -67,6 +67,7 @@ class Exports:
 def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Exports, overwrite: bool) -> tuple[dict[str, Any], list[Path]]:
     """Make and save a ladder; return its manifest and what was written besides the levels. Raises OutputExists and SettingsError at once, but for
     Streamed SOG of a ladder that comes out as a single level, because that has few enough splats or no other is of use."""
+    from mipmap_plugin.levels.ladder import refuse_no_viewer
     from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
     from mipmap_plugin.levels.room import room_for
     from mipmap_plugin.levels.streamed import SINGLE_LEVEL
@@ -75,6 +76,7 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     from mipmap_plugin.process import threads
 
     unfinished = settled(state_path(output))
+    refuse_no_viewer(wrapped.model)
     refuse_ladder(output, wrapped, overwrite=overwrite)
     with announced("planning the levels"):
         refuse_ladder(output, wrapped, overwrite=overwrite, room=room_for(wrapped, request, unfinished))

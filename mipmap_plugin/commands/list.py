@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
+from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
@@ -24,6 +26,8 @@ def list_(kinds: tyro.conf.Positional[tuple[Kind, ...]] = (), json: bool = False
         kinds: Only these; families and recipes are listed at once, the others after a moment.
         json: Print JSON.
     """
+    if not kinds:
+        _warn_of_other_groups()
     if json:
         return print_json({each: _facts(each) for each in kinds or KINDS})
     for each in kinds or KINDS:
@@ -31,6 +35,17 @@ def list_(kinds: tyro.conf.Positional[tuple[Kind, ...]] = (), json: bool = False
         added = [f"{name}: {what}" for name, what in facts["of packages"].items()]
         refused = [f"recognized and refused: {', '.join(facts['refused'])}"] if facts.get("refused") else []
         print_facts({each: [", ".join(facts["built in"]), *refused, *added]})
+
+
+def _warn_of_other_groups() -> None:
+    """Warn of packages whose entry points are in a group that nothing reads, as where its name is misspelled."""
+    with uncollected():
+        known = sorted(find()[0].group for find in KINDS.values())
+    points = entry_points()
+    for group in sorted(points.groups):
+        if group.startswith("mipmap_plugin.") and group not in known:
+            names = ", ".join(sorted({f"{point.name} ({point.value})" for point in points.select(group=group)}))
+            warnings.warn(f"{names}, in the group {group} of entry points, is not used: the groups are {', '.join(known)}", stacklevel=2)
 
 
 def _facts(kind: str) -> dict[str, Any]:

@@ -34,7 +34,7 @@ def show_before_and_after(base: Wrapped, adapted: Adapted) -> None:
 
 def protocol_here() -> Protocol | None:
     """How this terminal shows pictures; None if it does not."""
-    if VOICE.get().quiet or not is_terminal(sys.stdout) or os.environ.get("TERM", "dumb") == "dumb":
+    if VOICE.get().quiet or not is_terminal(VOICE.get().out) or os.environ.get("TERM", "dumb") == "dumb":
         return None
     from mipmap_plugin.formats.terminal import has_sixels, protocol_by_name
 

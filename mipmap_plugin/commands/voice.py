@@ -10,7 +10,7 @@ import sys
 import textwrap
 from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TextIO, cast
 
@@ -30,6 +30,12 @@ class Voice:
 
     quiet: bool = False
     log: Log | None = None
+    stdout: TextIO | None = None  # None: the standard output
+
+    @property
+    def out(self) -> TextIO:
+        """The stream to print to."""
+        return self.stdout or sys.stdout
 
     def write(self, text: str) -> None:
         """Write lines to the log; nothing without a log."""
@@ -45,7 +51,7 @@ def say(text: str, hanging: int | None = None) -> None:
     voice = VOICE.get()
     voice.write(text)
     if not voice.quiet:
-        put(text if hanging is None or not sys.stdout.isatty() else wrapped(text, hanging, shutil.get_terminal_size().columns))
+        put(text if hanging is None or not voice.out.isatty() else wrapped(text, hanging, shutil.get_terminal_size().columns))
 
 
 def wrapped(text: str, hanging: int, width: int) -> str:
@@ -63,10 +69,11 @@ def put(text: str) -> None:
 
     Raises OutputError if it cannot be printed, and BrokenPipeError if nobody reads it any more. After either, everything printed later is discarded.
     """
+    out = VOICE.get().out
     try:
-        print(text, flush=True)
+        print(text, file=out, flush=True)
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # otherwise Python reports the error again when it exits
+        os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())  # otherwise Python reports the error again when it exits
         if isinstance(error, BrokenPipeError):
             raise
         raise OutputError(f"the standard output cannot be written ({error.strerror}); print to another place") from error
@@ -122,6 +129,18 @@ def speaking(quiet: bool, log: Path | None) -> Iterator[None]:
             yield
         finally:
             VOICE.reset(token)
+
+
+@contextlib.contextmanager
+def alone() -> Iterator[None]:
+    """Inside the block only `put` prints to standard output, which may be JSON: what plug-ins and libraries print goes to standard error."""
+    voice = VOICE.get()
+    token = VOICE.set(replace(voice, stdout=voice.out))
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    finally:
+        VOICE.reset(token)
 
 
 class _NoTerminal:

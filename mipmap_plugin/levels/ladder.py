@@ -25,7 +25,7 @@ from mipmap_plugin.levels.store import LevelStore
 from mipmap_plugin.levels.switching import switching_zoom, zooms_between
 from mipmap_plugin.levels.yardstick import Yardstick
 from mipmap_plugin.limits import path_of
-from mipmap_plugin.models.base import why_no_viewer
+from mipmap_plugin.models.base import SplatModel, why_no_viewer
 from mipmap_plugin.process import threads
 from mipmap_plugin.progress import announced
 
@@ -38,14 +38,19 @@ MORE_SPLATS = "more splats than the finer level has"
 UNSHOWN = "at every zoom a neighbor is as good"
 
 
+def refuse_no_viewer(model: SplatModel) -> None:
+    """Raise SettingsError for a model that no viewer draws."""
+    if reason := why_no_viewer(model):
+        raise SettingsError(f"{model.family}: {reason}; levels are files for viewers, so adapt it to one scale at a time")
+
+
 def make_levels(base: FrozenBase, request: LadderRequest, resume: str | Path | None = None) -> Ladder:
     """Make the levels. `resume`: a folder for finished levels, to go on from after an interruption; saving the ladder removes it.
 
     Raises SettingsError for a model that no viewer draws, for views that show nothing and for a group of viewers, BackendUnavailable, Interrupted.
     """
     folder = None if resume is None else path_of(resume, "resume")
-    if reason := why_no_viewer(base.model):
-        raise SettingsError(f"{base.model.family}: {reason}; levels are files for viewers, so adapt it to one scale at a time")
+    refuse_no_viewer(base.model)
     base.refuse_undrawn()
     if by_distance(base, request):
         return make_levels_by_distance(base, request, folder)

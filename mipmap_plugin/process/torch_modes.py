@@ -67,21 +67,21 @@ class _Shared:
 
     def __init__(self, read: Callable[[], Any], write: Callable[[Any], object], usual: Any) -> None:
         self._lock, self._inside = Lock(), 0
-        self._read, self._write, self._usual = read, write, usual
+        self.read, self.write, self._usual = read, write, usual
         self._callers: Any = None
 
     def enter(self) -> None:
         with self._lock:
             self._inside += 1
-            if (now := self._read()) not in (self._usual, UNSET):
+            if (now := self.read()) not in (self._usual, UNSET):
                 self._callers = now
-                self._write(self._usual)
+                self.write(self._usual)
 
     def leave(self) -> None:
         with self._lock:
             self._inside -= 1
             if not self._inside and self._callers is not None:
-                self._write(self._callers)
+                self.write(self._callers)
                 self._callers = None
 
 
@@ -94,3 +94,29 @@ def _precisions() -> list[_Shared]:
 
 
 _shared = [_Shared(torch.get_default_dtype, torch.set_default_dtype, torch.float32), *_precisions()]
+
+
+def _set_default_device(device: torch.device) -> None:
+    torch.set_default_device(None if device.type == "cpu" else device)  # None: without a look at each call of torch
+
+
+# What a module may set for all of torch, most often at its top: how it is read, and how it is set.
+_settings: list[tuple[Callable[[], Any], Callable[[Any], object]]] = [
+    *((setting.read, setting.write) for setting in _shared),
+    (torch.get_default_device, _set_default_device),
+    (torch.get_num_threads, torch.set_num_threads),
+    (torch.is_grad_enabled, torch.set_grad_enabled),
+]
+
+
+@contextmanager
+def settings_kept() -> Iterator[None]:
+    """Undo what the block sets for all of torch, the state of its random numbers included: a plug-in that is only imported changes nothing else."""
+    before = [read() for read, _ in _settings]
+    try:
+        with torch.random.fork_rng(devices=()):
+            yield
+    finally:
+        for (read, write), value in zip(_settings, before, strict=True):
+            if read() != value:
+                write(value)

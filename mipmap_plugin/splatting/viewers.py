@@ -204,7 +204,8 @@ def viewers_for(name: str) -> tuple[str, ...]:
     viewer = _registered(name)
     if not isinstance(viewer, tuple):
         return (name,)
-    if not viewer or not all(isinstance(member, str) for member in viewer):
+    known = VIEWERS.names()
+    if not viewer or any(member not in known for member in viewer):
         raise PluginError(f"viewer group {name!r} must contain names of registered viewers, got {viewer!r}")
     return viewer
 

@@ -9,6 +9,8 @@ import pytest
 import tiny
 from commands_run import refused
 
+from mipmap_plugin.backends import BACKENDS
+from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.evaluation import viewer_differences
 from mipmap_plugin.formats.ply import read_ply, write_ply
 from mipmap_plugin.models import load_model
@@ -34,6 +36,15 @@ def test_inspect_of_an_adapted_file_ends_with_a_command_that_runs(run, tmp_path)
     told, _, command = verdict.partition("; next: ")
     assert told.startswith("sound, adapted to x0.25, at which alone it looks right")
     assert run(*shlex.split(command)[1:]) == (0, "1 picture in DIR, at x0.25, which the file was adapted for\n", "")
+
+
+def test_inspect_tells_of_a_backend_that_fails_and_says_the_rest(run, model_folder):
+    def fails(self, gaussians, camera, effects):
+        raise RuntimeError("no driver")
+
+    with BACKENDS.temporarily(fast=type("Fast", (CpuBackend,), {"speed": 99, "render": fails, "__module__": "theirs"})):
+        code, out, _ = run("inspect", model_folder)
+    assert code == 0 and re.search(r"\nviewers: +not drawn: backend 'fast' \(taken as the fastest.*\) failed: RuntimeError: no driver\n", out)
 
 
 def test_inspect_lists_the_effects_that_are_off_if_asked(run, model_folder):

@@ -157,6 +157,12 @@ def test_what_no_viewer_draws_has_no_levels(tmp_path, write, by):
         make_levels(base, request("supersplat", by=by))
 
 
+def test_the_command_does_not_advise_to_leave_out_the_viewer_that_it_needs(tmp_path, capsys):
+    base = moving.write_deformable(tmp_path / "base")
+    assert cli.main(["levels", str(base), "--viewer", "spark", "--output", str(tmp_path / "ladder")]) == 2
+    assert "levels are files for viewers, so adapt it to one scale at a time" in capsys.readouterr().err
+
+
 def test_the_command_makes_a_ladder_and_prints_it(tmp_path, capsys):
     base = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12), count=12)
     options = ["--viewer", "antialiased", "--coarsest", "1/2", "--ratio", "2", "--recipe", "instant", "--views", "given"]

@@ -51,6 +51,8 @@ def _enlarged(name: str, upsampler: Upsampler, image: Tensor, size: tuple[int, i
     with naming(f"upsampler {name!r}"):
         made: Any = upsampler(image.clone() if is_third_party(upsampler) else image, size)
     wanted = f"upsampler {name!r} has to return an image {[*size, 3]} of finite {image.dtype}"
+    if isinstance(made, Tensor) and made.device != image.device:
+        raise PluginError(f"{wanted}, on {image.device}, where it got one; it returned one on {made.device}")
     if not isinstance(made, Tensor) or tuple(made.shape) != (*size, 3) or made.dtype != image.dtype or not made.isfinite().all():
         raise PluginError(f"{wanted}; it returned {_described(made)}")
     low, high = (float(end) for end in made.aminmax())
