@@ -16,7 +16,7 @@ from mipmap_plugin.camera import OPENGL_TO_OPENCV, Camera
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import ROTATION_TOLERANCE, numbers, pixels, positive, present, read_json, rotation
-from mipmap_plugin.scenes.base import ABSENT, Scene, refuse_other_shape
+from mipmap_plugin.scenes.base import ABSENT, MASKED, Scene, refuse_other_shape
 from mipmap_plugin.scenes.cameras_json import numbers_views, trained_size
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, can_undistort, note
 
@@ -60,6 +60,9 @@ def read_transforms(path: str | Path, cfg: dict[str, Any] | None = None) -> Scen
         if absent:
             unsized = absent - sum(image is None for _, image, _ in found)
             notes.append(f"{file.name}: {_counted(absent)} {ABSENT}{_left_out(unsized)}")
+        if masked := sum(bool(frame.get("mask_path")) for frame in read_json(file)["frames"]):
+            unread = "masks are not read, so that what they hide counts like all else"
+            notes.append(f"{file.name}: frames that are {MASKED} (mask_path): {masked}; {unread}")
     if not views:
         raise SceneError(f"{path}: none of the listed images is there, and the sizes are unknown; add the images, or w and h to the file")
     if cfg:
