@@ -54,9 +54,9 @@ def base_cameras(wrapped: Wrapped, given: Path | None) -> str:
 
 
 def scene(base: Base, path: Path) -> Scene:
-    """The scene at `path`, whose photographs judge a checkpoint; a warning tells of absent ones. Raises CheckpointError, SceneError."""
+    """The scene at `path`, whose photographs judge a checkpoint; a warning tells of absent and masked ones. Raises CheckpointError, SceneError."""
     read = base.photographs(path)
-    for note in read.absent():
+    for note in read.warnings():
         warnings.warn(f"{path}: {note}", stacklevel=2)
     return read
 

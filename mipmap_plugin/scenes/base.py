@@ -20,6 +20,9 @@ from mipmap_plugin.scenes.lenses import Lens
 # The word of notes on photographs that are not there.
 ABSENT = "absent"
 
+# The word of notes on photographs of which a part is hidden, which is not done here.
+MASKED = "masked"
+
 # The words of notes on which views are taken to be for testing.
 SPLIT = "is for testing"
 
@@ -65,9 +68,9 @@ class Scene:
         """Whether it is what a scene was trained on, and not the cameras.json of a checkpoint."""
         return bool(self.images) or self.points is not None or self.applied is not None
 
-    def absent(self) -> list[str]:
-        """The notes on photographs that are listed and not there: fewer views are judged than the files list."""
-        return [note for note in self.notes if f" {ABSENT}" in note]
+    def warnings(self) -> list[str]:
+        """The notes that concern every figure: on photographs that are listed and not there, and on masked ones."""
+        return [note for note in self.notes if f" {ABSENT}" in note or f" {MASKED}" in note]
 
     def split(self, name: str) -> list[Camera]:
         """The cameras of "train" or "test", in file order. Raises SettingsError for another name."""

@@ -16,7 +16,7 @@ from mipmap_plugin.camera import OPENGL_TO_OPENCV, Camera
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import ROTATION_TOLERANCE, numbers, pixels, positive, present, read_json, rotation
-from mipmap_plugin.scenes.base import ABSENT, Scene, refuse_other_shape
+from mipmap_plugin.scenes.base import ABSENT, MASKED, Scene, refuse_other_shape
 from mipmap_plugin.scenes.cameras_json import numbers_views, principal_point, trained_size
 from mipmap_plugin.scenes.intrinsics import DISTORTION, overruled, values_of
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, can_undistort, note
@@ -158,6 +158,8 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
     notes = [f"{file.name}: {_counted(absent)} {ABSENT}{_left_out(unsized)}"] if absent else []
     if passed_over:
         notes.append(f"{file.name}: the intrinsics of {passed_over} of its frames are passed over for those of the file, as in nerfstudio")
+    if masked := sum(bool(frame.get("mask_path")) for frame in frames):
+        notes.append(f"{file.name}: frames that are {MASKED} (mask_path): {masked}; masks are not read, so that what they hide counts like all else")
     return views, places, notes
 
 

@@ -179,7 +179,7 @@ def _set_opacities(model: VanillaModel, opacities: Tensor) -> None:
 
 @torch.no_grad()
 def psnr(scene: TiledScene, splats: Splats, truths: Truths, views: Any) -> float:
-    """The mean PSNR (dB) of splats as the target shows them over views, of images clamped as a display does (`validation.mean_db`)."""
+    """The mean PSNR (dB) of splats as the target shows them over views, of images and truths clamped as a display does (`validation.mean_db`)."""
     painter = scene.painter(scene.target)
-    images = ((painter.image(splats, view.zoomed(scene.scale)).clamp(0, 1), truths(view)) for view in views)
-    return mean_db([float((image - truth).square().mean()) for image, truth in images])
+    images = ((painter.image(splats, view.zoomed(scene.scale)), truths(view)) for view in views)
+    return mean_db([float((image.clamp(0, 1) - truth.clamp(0, 1)).square().mean()) for image, truth in images])

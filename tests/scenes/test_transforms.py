@@ -76,6 +76,13 @@ def test_absent_images_whose_cameras_stay_are_counted_alone(tmp_path):
     assert read_transforms(write_json(tmp_path / "transforms.json", data)).notes == ["transforms.json: 1 listed image is absent"]
 
 
+def test_masks_are_told_of_for_they_are_not_read(tmp_path):
+    frames = [frame(mask_path="masks/r_0.png"), frame(mask_path=None)]
+    scene = read_transforms(write_json(tmp_path / "transforms.json", {"camera_angle_x": 0.8, "w": 40, "h": 30, "frames": frames}))
+    masked = "transforms.json: frames that are masked (mask_path): 1; masks are not read, so that what they hide counts like all else"
+    assert scene.warnings() == ["transforms.json: 2 listed images are absent", masked]
+
+
 def test_the_scale_of_a_cameras_axes_is_left_out(tmp_path):
     """As Blender writes it for a camera that was made smaller; its place is the same."""
     data = {"camera_angle_x": 0.8, "w": 40, "h": 30}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import tiny
@@ -18,7 +19,7 @@ from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.screen_filters import DILATION
 from mipmap_plugin.tiles import steering
 from mipmap_plugin.tiles.run import adapt_in_tiles
-from mipmap_plugin.tiles.start import StartSearch
+from mipmap_plugin.tiles.start import StartSearch, psnr
 from mipmap_plugin.tiles.steering import Steered, sweep_of
 from mipmap_plugin.tiles.sweeps import Sweep, sweeps, views_of
 
@@ -71,6 +72,14 @@ def test_without_a_closed_form_merged_splats_keep_their_opacities(job, monkeypat
     monkeypatch.setattr("mipmap_plugin.tiles.start.psnr", lambda scene, splats, *_: -float(len(splats)))
     StartSearch(scene).run()
     assert torch.load(scene.folder / "start.pt")["name"] == "merged splats"
+
+
+def test_a_truth_brighter_than_white_is_judged_as_it_is_displayed():
+    """As without tiles: a bicubic filter makes it so beside edges."""
+    filled = lambda level: torch.full((2, 2, 3), level)  # noqa: E731
+    painter = SimpleNamespace(image=lambda splats, view: filled(1.0))
+    scene = SimpleNamespace(painter=lambda target: painter, target=None, scale=0.5)
+    assert psnr(scene, None, lambda view: filled(1.1), tiny.cameras(1)) == psnr(scene, None, lambda view: filled(1.0), tiny.cameras(1))
 
 
 def test_a_run_is_cut_into_a_warm_up_and_sweeps():

@@ -3,9 +3,13 @@
 from dataclasses import replace
 
 import pytest
+import tiny
 
+from mipmap_plugin.evaluation.tradeoff import measuring
 from mipmap_plugin.evaluation.tradeoff.front import Tradeoff, files, frames, front, knee, milliseconds, seconds
-from mipmap_plugin.evaluation.tradeoff.points import Point, Spread
+from mipmap_plugin.evaluation.tradeoff.points import Plan, Point, Spread
+from mipmap_plugin.evaluation.tradeoff.truth import base_itself
+from mipmap_plugin.wrap import wrap_model
 
 
 def point(db, s=0.0, ms=None, kind="adapted", name="default"):
@@ -32,6 +36,13 @@ def test_the_front_of_seconds_is_of_files_and_that_of_frames_of_what_was_timed()
     free = [point(30, 0, 50, "supersampling", "supersampling, 8 x 8"), point(15, 0, 6, "filter", "scaled"), point(22, 8, 900, "renderer", "tile 8")]
     assert files([*RUN, *free]) == RUN
     assert frames([*RUN, *free]) == [BASE, RUN[-1], *free]
+
+
+def test_files_for_a_viewer_are_compared_with_the_base_in_it():
+    """Not with the base as its training drew it, by a filter that the viewer lacks."""
+    model = wrap_model(tiny.model(30), cameras=tiny.cameras(3), screen_filter="mip")
+    found = measuring._baselines(model, base_itself(model, 1 / 2, 1), 1 / 2, Plan(viewer="classic"))
+    assert [each.name for each in found if each.kind == "base"] == ["base in classic"]
 
 
 def test_the_knee_lies_furthest_above_the_line_between_the_ends():

@@ -134,6 +134,11 @@ def test_decibels_are_the_mean_of_each_view_as_it_is_displayed():
     assert judge(0.5).steer(shows(0.6, 1.7)) == pytest.approx(by_hand, abs=1e-4)
 
 
+def test_a_truth_brighter_than_white_is_displayed_as_white():
+    """So a bicubic filter makes it beside edges."""
+    assert judge(1.1).quality(shows(1.1, 1.0)) == judge(1.0).quality(shows(1.0, 1.0))
+
+
 def test_what_nobody_sees_outweighs_nothing():
     """A view of a plain sky that falls from 90 dB to 60, beside one that rises from 20 to 30."""
     sky, better = (10 ** (-db / 20) for db in (90, 60))

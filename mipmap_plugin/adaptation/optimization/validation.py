@@ -106,8 +106,8 @@ class Validation:
         threads = max_threads(model.parameters()["means"], cameras[0])
 
         def error(draw: Callable[[Camera], Tensor], number: int) -> Tensor:
-            image = draw(cameras[number]).clamp(0, 1)
-            return difference_from(self.truth(views[number]), image, self.resize).square().mean()
+            image, truth = draw(cameras[number]).clamp(0, 1), self.truth(views[number]).clamp(0, 1)
+            return difference_from(truth, image, self.resize).square().mean()
 
         draws = [_drawing(render, model, shared, cameras) for render in self.renders]
         errors = [list(side_by_side(partial(error, draw), range(len(views)), threads)) for draw in draws]

@@ -155,7 +155,9 @@ def on_backend(model: Wrapped, name: str) -> Wrapped:
 def _baselines(model: Wrapped, truth: GroundTruth, scale: float, plan: Plan) -> list[Baseline]:
     """All baselines, except those that are the truth itself."""
     found = baselines(model, scale, truth.shrink_by, filters=_filters(model), samples=plan.supersampling)
-    found += [base_in_viewer(plan.viewer, model, scale)] if plan.viewer else []
+    if plan.viewer:  # which may lack the filter of the base's training: files for it are better or worse than what it shows
+        found = [replace(baseline, kind="filter") if baseline.name == BASE else baseline for baseline in found]
+        found.append(base_in_viewer(plan.viewer, model, scale))
     return [baseline for baseline in found if baseline.name not in truth.itself]
 
 
