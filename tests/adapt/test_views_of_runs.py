@@ -70,6 +70,13 @@ def test_views_that_lose_while_the_others_gain_are_told_of_with_their_lenses():
     assert f"of {3 * views[0].fx:.0f} px and more, where the shortest has {views[0].fx:.0f} px: adapt with the cameras of each lens" in told
 
 
+def test_the_report_tells_of_longer_lenses_that_the_file_suits_less_than_the_base():
+    views = [replace(view, fx=times * view.fx, fy=times * view.fy) for view, times in zip(tiny.cameras(8), (1, 8) * 4, strict=True)]
+    with pytest.warns(UserWarning, match="the file looks worse than the base.* longer lenses") as told:
+        report = wrap_model(tiny.model(20), cameras=views).adapt(1 / 4, recipe="instant").report
+    assert [note for note in report.notes if note in {str(each.message) for each in told}]
+
+
 def test_lenses_are_not_blamed_where_the_views_that_lose_have_the_same():
     [told] = worse_views(tiny.cameras(2), [20.0, 36.0], [30.0, 28.0])
     assert told.endswith("(36.0 -> 28.0), though it gains by their mean")
