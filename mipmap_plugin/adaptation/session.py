@@ -27,7 +27,7 @@ from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Qu
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, color_limits, unrounded, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, option_note, simulated, versions
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer, ends_run
-from mipmap_plugin.adaptation.shown import refuse_blind, remarks, showing, too_unlike
+from mipmap_plugin.adaptation.shown import refuse_blind, remarks, showing, too_unlike, worse_views
 from mipmap_plugin.adaptation.start.candidates import UNMATCHED, StartSearch
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
 from mipmap_plugin.adaptation.start.problem import StartProblem
@@ -72,8 +72,7 @@ class Session:
         self.config = config = fitting(self.config, self.base_effects, self.base_views, scale)
         self.seconds["total"] = sum(self.seconds.values())
         self._closest_of = cameras if scale > 1 and cameras else self.base_views  # a zoom-in is as fine as what the base was seen from
-        self.views = over_band(self.base_views, config)
-        self.views_note += f", {real.note(self.base_views)}" if real else ""
+        self.views, self.views_note = over_band(self.base_views, config), self.views_note + (f", {real.note(self.base_views)}" if real else "")
         steering, choosing = (over_band(half, config) for half in (validation[::2], validation[1::2]))
         request.images.keep_only([*self.views, *steering, *choosing])
         self.truth = PseudoTruth(request.images, scale, config, real)
@@ -156,11 +155,13 @@ class Session:
         allowed = [name for name, model in states.items() if len(model.parameters()["means"]) <= self._most_splats]
         began, (base, start, *_), last = now(self.device), states, allowed[-1]
         with self.phase("validation"):
-            best, psnrs = self.validation.choose(states, allowed)
+            best, psnrs, by_view = self.validation.choose(states, allowed)
         self.seconds["total"] += now(self.device) - began
         if self.config.returns == "last":
             best = last
-        elif self.detail is not None and psnrs[last] >= max(psnrs[name] for name in allowed if name in (base, start)) - HARM_DB:
+        elif self.detail is None:
+            self.notes = [*self.notes, *worse_views(self.validation.choosing, by_view[base], by_view[best])]
+        elif psnrs[last] >= max(psnrs[name] for name in allowed if name in (base, start)) - HARM_DB:
             best = last  # a network adds detail that the base's own image does not have, so that its gain cannot be measured
         note = "" if best == last else f": {psnrs[best]:.2f} dB on validation views, {last} {psnrs[last]:.2f} dB"
         seconds, count = self.seconds["total"], count_of(states[last], self.views[0], self.scale)
@@ -261,8 +262,7 @@ class Session:
     def _fingerprint(self) -> str:
         """A hash of everything that a run depends on, so that a state is never resumed as another run."""
         base = digest_of_model(self.base) + ("" if self.finer is None else digest_of_parameters(self.finer.model))
-        targets = [asdict(target) for target in self.targets.values()]
-        settings, views = self.config.model_dump(), digest_of(self.views)
+        targets, settings, views = [asdict(target) for target in self.targets.values()], self.config.model_dump(), digest_of(self.views)
         facts = [base, dict(self.request.inputs), self.scale, settings, self.backend.name, asdict(self.base_effects), targets, views]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 

@@ -11,6 +11,7 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.optimization.validation import HARM_DB
 from mipmap_plugin.adaptation.parallel import in_batches
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.errors import SettingsError
@@ -44,6 +45,12 @@ VIEWED = ", or adapt for what you look at (mipmap-plugin view)"
 
 # Lenses whose focal lengths (px) have a larger ratio need different files, as scales of that ratio do. A ratio of 5 costs a capture 10 of 12 dB.
 UNLIKE = 3.0
+
+# A lens is called longer from this many times the shortest focal length on: what it sees is as one scale of a ladder and the next.
+LONGER = 2.0
+
+# What to do about lenses that no single file fits.
+EACH_LENS = "adapt with the cameras of each lens on their own"
 
 # How far a splat is visible, in standard deviations; and the distance that views of an orbit keep from a scene, in near planes.
 SEEN, CLEAR = 3, 2
@@ -98,11 +105,33 @@ def refuse_large(views: Sequence[Camera], model: SplatModel, scale: float) -> No
 
 def too_unlike(views: Sequence[Camera]) -> str:
     """That lenses differ so much that no file fits all of them, in a sentence; "" if they do not."""
-    shortest, longest = (pick(math.sqrt(view.fx * view.fy) for view in views) for pick in (min, max))
+    shortest, longest = (pick(map(_focal, views)) for pick in (min, max))
     if longest <= UNLIKE * shortest:
         return ""
     where = f"focal lengths of the cameras are {shortest:.0f} to {longest:.0f} px, and what looks right through one does not through another"
-    return f"{where}; adapt with the cameras of each lens on their own"
+    return f"{where}; {EACH_LENS}"
+
+
+def worse_views(views: Sequence[Camera], before: Sequence[float], after: Sequence[float]) -> list[str]:
+    """That the file shows some views worse than the base does, while it gains by their mean, in a sentence; none where it loses by their mean.
+
+    `before`, `after`: dB of each view as far as differences are visible.
+    """
+    worse = [then > now + HARM_DB for then, now in zip(before, after, strict=True)]
+    if not any(worse) or sum(after) < sum(before):
+        return []
+    then, now = max(compress(zip(before, after, strict=True), worse), key=lambda pair: pair[0] - pair[1])
+    where = f"in {sum(worse)} of the {len(views)} views that it was chosen by, the file looks worse than the base"
+    told = f"{where}, by up to {then - now:.1f} dB as far as differences can be seen ({then:.1f} -> {now:.1f}), though it gains by their mean"
+    shortest, longer = min(map(_focal, views)), min(map(_focal, compress(views, worse)))
+    if longer >= LONGER * shortest:
+        told += f"; they are seen through longer lenses, of {longer:.0f} px and more, where the shortest has {shortest:.0f} px: {EACH_LENS}"
+    return [told]
+
+
+def _focal(view: Camera) -> float:
+    """The focal length of both axes, px."""
+    return math.sqrt(view.fx * view.fy)
 
 
 def too_near(views: Sequence[Camera], means: Tensor, near: float) -> str:

@@ -132,8 +132,8 @@ class Validation:
         errors = self._errors(model, self.steering)
         return Quality(*(decibel(fmean(10 ** (-mean(each) / 10) for each in errors)) for mean in (_visible_db, mean_db)))
 
-    def choose(self, states: dict[str, SplatModel], allowed: Collection[str] | None = None) -> tuple[str, dict[str, float]]:
-        """Return the name of the state of the best visible quality, of those that are `allowed`, and the PSNR of each state in its worst viewer.
+    def choose(self, states: dict[str, SplatModel], allowed: Collection[str] | None = None) -> tuple[str, dict[str, float], dict[str, list[float]]]:
+        """The state of the best visible quality, of those that are `allowed`, each state's PSNR in its worst viewer, and its visible dB of each view.
 
         Of states that are equal the last, but none that is worse than the first of `states`, which is what went in.
         """
@@ -142,7 +142,9 @@ class Validation:
         among = [name for name in states if allowed is None or name in allowed]
         best, first = max(quality[name] for name in among), next(iter(states))
         least = max(best - TIE_DB, quality[first]) if first in among else best - TIE_DB
-        return [name for name in among if quality[name] >= least][-1], {name: min(map(mean_db, each)) for name, each in errors.items()}
+        chosen = [name for name in among if quality[name] >= least][-1]
+        by_view = {name: [_visible_db([fmean(one)]) for one in zip(*each, strict=True)] for name, each in errors.items()}
+        return chosen, {name: min(map(mean_db, each)) for name, each in errors.items()}, by_view
 
 
 def _drawing(
