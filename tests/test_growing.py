@@ -157,7 +157,8 @@ def test_rows_that_are_as_many_but_others_have_no_columns_of_the_base(monkeypatc
     """Pruned after the first step, and grown to as many as the base has, which is where growing ends, after the second."""
     found = iter([30.0, 40.0, 39.0])  # in the beginning, after step 2, after step 4
     monkeypatch.setattr(Validation, "quality", lambda self, model: Quality(*[next(found)] * 2))
-    monkeypatch.setattr(Validation, "choose", lambda self, states, allowed: (list(states)[2], dict.fromkeys(states, 0.0)))
+    chosen = lambda states: (list(states)[2], dict.fromkeys(states, 0.0), dict.fromkeys(states, ()))  # noqa: E731
+    monkeypatch.setattr(Validation, "choose", lambda self, states, allowed: chosen(states))
     base = VanillaModel(tiny.model(40).parameters(), origin=Origin(extras={"confidence": np.arange(40, dtype=np.float32)}))
     rates = LearningRates(means=0.05, scales=0.02, quats=0.004, opacities=0.05, sh0=0.015, shN=0.02)  # with which one splat is pruned
     settings = dict(most_growth=1, densify_gradient=1e-12, min_opacity=0.5, prune_every=1, steps=4, check_every=2, merge_to=1.0, warm_up=0)

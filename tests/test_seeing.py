@@ -40,10 +40,9 @@ def test_tiles_and_levels_by_distance_leave_them_out_too(tmp_path):
     work = tmp_path / "work"
     work.mkdir()
     make_cut(folder, 2, work)
-    tiles = opened(Base(folder), 0.5, None, recipe("default", 0.5, views="given"), work)
     base, request = wrap_model(folder), LadderRequest("playcanvas", coarsest=1 / 8)
     levels = scene_of(base, request, request.first_band(base))
-    for views in (lambda: tiles.views.adapted, lambda: levels.views):
+    for views in (lambda: opened(Base(folder), 0.5, None, recipe("default", 0.5, views="given"), work).views.adapted, lambda: levels.views):
         with pytest.warns(UserWarning, match="5 of 8 cameras see no splat"):
             assert len(showing(views(), base.model.parameters()["means"], 0.2)) == len(views()) == 3
 
