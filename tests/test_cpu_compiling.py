@@ -142,12 +142,11 @@ def test_functions_of_others_are_compiled_as_numba_does(searches):
     assert searches() == ["float64"]
 
 
-def test_a_kernel_is_optimized_once(monkeypatch):
-    made, manager = [], CPUCodegen._module_pass_manager
-    monkeypatch.setattr(CPUCodegen, "_module_pass_manager", lambda codegen, **options: (made.append("module"), manager(codegen, **options))[1])
-    monkeypatch.setattr(CPUCodegen, "_function_pass_manager", lambda codegen: made.append("function"))
+def test_no_function_of_a_kernel_is_optimized_before_the_whole(monkeypatch):
+    monkeypatch.delattr(CPUCodegen, "_function_pass_manager")
     assert compiling.kernel(lambda x: x + 1)(2.0) == 3
-    assert made == ["module"]
+    with pytest.raises(AttributeError, match="_function_pass_manager"):
+        numba.njit(lambda x: x + 1)(2.0)
 
 
 def test_with_a_later_numba_kernels_compile_as_it_likes(monkeypatch):

@@ -153,14 +153,10 @@ class _KernelCompiler(_Compiler):
 
 
 class _KernelLibrary(JITCodeLibrary):
-    """Optimized once: numba does it function by function first, and cheaply all together, for the sake of reference counts."""
+    """Optimized as a whole: numba does it function by function before."""
 
     def _optimize_functions(self, module):
         module.data_layout = self._codegen._data_layout
-
-    def _optimize_final_module(self):
-        passes, builder = self._codegen._module_pass_manager()
-        passes.run(self._final_module, builder)
 
 
 class _InnerCompiler(_Compiler):
