@@ -160,7 +160,7 @@ class Session:
         if self.config.returns == "last":
             best = last
         elif self.detail is None:
-            self.notes = [*self.notes, *worse_views(self.validation.choosing, by_view[base], by_view[best])]
+            self.notes = [*self.notes, *(worse_views(self.validation.choosing, by_view[base], by_view[best]) if self.wanted is None else [])]
         elif psnrs[last] >= max(psnrs[name] for name in allowed if name in (base, start)) - HARM_DB:
             best = last  # a network adds detail that the base's own image does not have, so that its gain cannot be measured
         note = "" if best == last else f": {psnrs[best]:.2f} dB on validation views, {last} {psnrs[last]:.2f} dB"
