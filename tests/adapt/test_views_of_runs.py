@@ -82,6 +82,12 @@ def test_lenses_are_not_blamed_where_the_views_that_lose_have_the_same():
     assert told.endswith("(36.0 -> 28.0), though it gains by their mean")
 
 
+def test_the_zooms_of_a_band_are_no_lenses():
+    """All views of a level have the same lens, and lie at different zooms."""
+    [told] = worse_views([view.zoomed(zoom) for view, zoom in zip(tiny.cameras(2), (0.5, 2), strict=True)], [20.0, 36.0], [30.0, 28.0])
+    assert told.endswith("though it gains by their mean")
+
+
 @pytest.mark.parametrize("after", [[21.0, 36.0], [20.0, 35.95], [21.0, 30.0]])
 def test_nothing_is_told_of_views_where_none_loses_or_their_mean_does(after):
     assert worse_views(tiny.cameras(2), [20.0, 36.0], after) == []
