@@ -3,6 +3,7 @@
 import gc
 import signal
 import weakref
+from dataclasses import replace
 
 import pytest
 import tiny
@@ -66,6 +67,14 @@ def test_a_zoom_in_starts_from_it_and_tells_so():
     assert report.notes[-1].startswith("converted at x1 before, ") and report.notes[-1].endswith(", in 3 steps")
     assert 0 < report.seconds["conversion"] < report.seconds["total"]
     assert report.curve[0].seconds > report.seconds["conversion"]
+
+
+def test_views_that_lose_are_told_of_the_file_alone():
+    """Of the conversion, which nobody sees, it was said too that it is the file, with other dB."""
+    views = [replace(view, fx=times * view.fx, fy=times * view.fy) for view, times in zip(tiny.cameras(8), (1, 3) * 4, strict=True)]
+    with pytest.warns(UserWarning, match="the file for x2 looks worse than the base"):
+        report = wrap_model(tiny.model(20), cameras=views).adapt(2, viewer="antialiased", steps=30, seed=1).report
+    assert sum(" looks worse than the base" in note for note in report.notes) == 1
 
 
 def test_the_first_stage_is_forgotten_before_the_second(monkeypatch):

@@ -149,6 +149,19 @@ def test_no_function_of_a_kernel_is_optimized_before_the_whole(monkeypatch):
         numba.njit(lambda x: x + 1)(2.0)
 
 
+def test_a_kernel_has_nothing_of_what_others_compiled_with_other_options_meanwhile():
+    """It raised ZeroDivisionError, as theirs does, where a kernel has infinity."""
+
+    def inverse(x):
+        raise NotImplementedError
+
+    numba.extending.overload(inverse)(lambda x: lambda x: 1 / x)
+    assert compiling.kernel(lambda x: inverse(x))(0.0) == np.inf
+    with pytest.raises(ZeroDivisionError):
+        numba.njit(lambda x: inverse(x))(0.0)
+    assert compiling.kernel(lambda x: inverse(x) + 1)(0.0) == np.inf
+
+
 def test_with_a_later_numba_kernels_compile_as_it_likes(monkeypatch):
     monkeypatch.setattr(compiling, "IS_KNOWN", False)
     use, plus = called_with_constants()

@@ -10,9 +10,10 @@ import tiny
 from mipmap_plugin import cli, load_model
 from mipmap_plugin.errors import OutputError, SettingsError
 from mipmap_plugin.formats.ply import read_header
-from mipmap_plugin.levels.fitting import ARCHIVE, UNKNOWN, fitting_scale, read_size, splats_within
+from mipmap_plugin.levels.fitting import ARCHIVE, UNKNOWN, fitting_scale, read_size, recorded, splats_within
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.recipes import recipe, scale_of_fraction
+from mipmap_plugin.wrap import wrap_model
 
 # Bytes of a splat with SH of degree 1, in float32: a mean and a normal, 4 coefficients of 3 colors, an opacity, scales and a quaternion.
 ROW = 4 * (3 + 3 + 12 + 1 + 3 + 4)
@@ -91,6 +92,15 @@ def test_a_file_is_as_large_as_it_may_be_and_no_larger(tmp_path, options):
     words = ["adapt", str(base), "--bytes", str(size), "--output", str(output), "--steps", "1", "--views", "given"]
     assert cli.main([*words, *options]) == 0
     assert size - UNKNOWN - 2 * read_header(output).vertex.stride <= output.stat().st_size <= size
+
+
+def test_what_is_recorded_of_a_network_is_known_before_the_run(tmp_path):
+    """Its hash was no part of the header that room was left for: with that of photographs it had more bytes than were kept for the unknown."""
+    (network := tmp_path / "net.pth").write_bytes(b"weights")
+    base, settings = wrap_model(tiny.model(), cameras=tiny.cameras(2)), {"recipe": "instant", "upsampler": str(network)}
+    with pytest.warns(UserWarning, match="is not used"):
+        report = base.adapt(2, **settings).report
+    assert recorded(base, [(2.0, None)], settings)["inputs"] == report.inputs
 
 
 def test_a_file_of_fewer_splats_at_the_bases_own_scale_is_optimized():

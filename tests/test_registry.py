@@ -221,6 +221,25 @@ def test_a_plug_in_that_is_imported_leaves_torch_as_it_was(tmp_path, monkeypatch
     assert state() == before
 
 
+# Of torch 2.9 and newer.
+NEWER = ["torch.backends.cuda.matmul.fp32_precision = torch.backends.fp32_precision = 'tf32'"] * hasattr(torch.backends, "fp32_precision")
+
+
+@pytest.mark.parametrize("line", ["torch.set_float32_matmul_precision('high')", "torch.backends.cuda.matmul.allow_tf32 = True", *NEWER])
+def test_the_precision_that_a_plug_in_sets_is_undone_by_all_ways_to_tell_it(tmp_path, monkeypatch, line):
+    """Torch refused to tell it any more, as of two interfaces that were mixed."""
+
+    def state():
+        return torch.get_float32_matmul_precision(), torch.backends.cuda.matmul.allow_tf32
+
+    (tmp_path / "rough_plugin.py").write_text(f"import torch\n{line}\nthing = 1")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "rough_plugin", raising=False)
+    before = state()
+    load_target("rough", "rough_plugin:thing")
+    assert state() == before
+
+
 @pytest.mark.parametrize("target", ["mipmap_plugin.registry:Registry.names", "mipmap_plugin.registry:Registry.names [fast]"])
 def test_targets_are_written_as_those_of_entry_points(target):
     assert load_target("names", target) is Registry.names

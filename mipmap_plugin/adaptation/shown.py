@@ -112,8 +112,8 @@ def too_unlike(views: Sequence[Camera]) -> str:
     return f"{where}; {EACH_LENS}"
 
 
-def worse_views(views: Sequence[Camera], before: Sequence[float], after: Sequence[float]) -> list[str]:
-    """That the file shows some views worse than the base does, while it gains by their mean, in a sentence; none where it loses by their mean.
+def worse_views(views: Sequence[Camera], before: Sequence[float], after: Sequence[float], scale: float) -> list[str]:
+    """That the file for `scale` shows some views worse than the base does, while it gains by their mean, in a sentence; none where it loses by that.
 
     `before`, `after`: dB of each view as far as differences are visible.
     """
@@ -121,7 +121,7 @@ def worse_views(views: Sequence[Camera], before: Sequence[float], after: Sequenc
     if not any(worse) or sum(after) < sum(before):
         return []
     then, now = max(compress(zip(before, after, strict=True), worse), key=lambda pair: pair[0] - pair[1])
-    where = f"in {sum(worse)} of the {len(views)} views that it was chosen by, the file looks worse than the base"
+    where = f"in {sum(worse)} of the {len(views)} views that it was chosen by, the file for x{scale:g} looks worse than the base"
     told = f"{where}, by up to {then - now:.1f} dB as far as differences can be seen ({then:.1f} -> {now:.1f}), though it gains by their mean"
     shortest, longer = min(map(_focal, views)), min(map(_focal, compress(views, worse)))
     if longer >= LONGER * shortest:
@@ -130,8 +130,8 @@ def worse_views(views: Sequence[Camera], before: Sequence[float], after: Sequenc
 
 
 def _focal(view: Camera) -> float:
-    """The focal length of both axes, px."""
-    return math.sqrt(view.fx * view.fy)
+    """The focal length of both axes, px, of the lens itself: a view of a band lies at a zoom of its own."""
+    return math.sqrt(view.fx * view.fy) / view.zoom
 
 
 def too_near(views: Sequence[Camera], means: Tensor, near: float) -> str:

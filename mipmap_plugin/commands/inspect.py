@@ -81,7 +81,7 @@ def _facts(checkpoint: Path, wrapped: Wrapped, given: Path | None, *, whole: boo
 
     model = wrapped.model
     with announced("examining"):
-        gaussians = model.gaussians(wrapped.views()[0])
+        gaussians = model.gaussians(wrapped.views()[0].zoomed(_adapted_to(wrapped) or 1.0))
         health = examine(model if holds_splats(model) else VanillaModel.from_gaussians(by_axes(gaussians), model.trained))
         effects = explain(wrapped.effects(), gaussians, effects_of(model))
         lost = remarks(wrapped.views(), model, wrapped.effects().near_plane, orbit=not wrapped.cameras)

@@ -77,12 +77,13 @@ def baselines(
 
     def rendered(name: str, kind: Kind, screen_filter: str | None, n: int = 1) -> Baseline:
         backend = model.backend(screen_filter=screen_filter)[0].name
-        return Baseline(name, kind, backend, splats_shown(model, scale), lambda view: _render(model, view.zoomed(scale), scale, screen_filter, n))
+        return Baseline(name, kind, backend, shown, lambda view: _render(model, view.zoomed(scale), scale, screen_filter, n))
 
     def resized(name: str, by: str) -> Baseline:
         render = lambda view: resized_base(model.render(view).image, view.zoomed(scale).size, shrink_by=shrink_by, upsampler=by)  # noqa: E731
         return Baseline(name, "supersampling" if scale < 1 else "filter", model.backend()[0].name, splats_shown(model), render)
 
+    shown = splats_shown(model, scale)  # once, for networks may have to make them
     found = [rendered(BASE, "base", None)]
     if scale == 1:
         return found

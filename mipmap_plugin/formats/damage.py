@@ -43,7 +43,7 @@ def _damage_of_gzip(path: Path, most: int) -> str:
             size += len(stream.decompress(block))
             if size > most:
                 return TOO_LARGE
-        rest = stream.unused_data or file.read(len(GZIP))
+        rest = stream.unused_data + file.read(len(GZIP))
     if not stream.eof:
         return "it is cut off"
     return "" if not rest or rest.startswith(GZIP) else "other bytes follow its end"

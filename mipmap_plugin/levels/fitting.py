@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.adaptation.report import provenance, versions
+from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.errors import TEMPORARY, MipmapPluginError, SettingsError
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import WRITTEN
@@ -61,9 +62,14 @@ def recorded(base: FrozenBase, requests: Sequence[tuple[float, str | None]], set
     unknown or out of range.
     """
     further = {**settings, "most_splats": len(base.model.parameters()["means"])}
-    name, digest = further.pop("recipe"), digest_of_model(base.model)
-    made_from = {"base": digest, "inputs": base.asked, "orbit": asdict(base.viewpoints.orbit)}
-    records = [provenance({"scale": scale, "viewer": viewer, **made_from}, recipe(name, scale, **further), versions()) for scale, viewer in requests]
+    name, known = further.pop("recipe"), {"base": digest_of_model(base.model), "orbit": asdict(base.viewpoints.orbit)}
+
+    def record(scale: float, viewer: str | None) -> dict[str, Any]:
+        config = recipe(name, scale, **further)
+        inputs = base.asked | network_input(config.upsampler)
+        return provenance({"scale": scale, "viewer": viewer, "inputs": inputs, **known}, config, versions())
+
+    records = [record(scale, viewer) for scale, viewer in requests]
     degree = getattr(base.model, "sh_degree", 0)
     return max(records, key=lambda of: (degree_for(of["viewer"], degree), wants_filter(of["viewer"]), len(json.dumps(of, default=str))))
 

@@ -100,9 +100,33 @@ def _set_default_device(device: torch.device) -> None:
     torch.set_default_device(None if device.type == "cpu" else device)  # None: without a look at each call of torch
 
 
-# What a module may set for all of torch, most often at its top: how it is read, and how it is set.
-_settings: list[tuple[Callable[[], Any], Callable[[Any], object]]] = [
-    *((setting.read, setting.write) for setting in _shared),
+def _older_precision() -> str:
+    """How products of matrices are rounded, by torch's older functions, which refuse to tell it where newer ones have set it."""
+    try:
+        return torch.get_float32_matmul_precision()
+    except RuntimeError:
+        return UNSET
+
+
+def _set_older_precision(precision: str) -> None:
+    if precision != UNSET:
+        torch.set_float32_matmul_precision(precision)
+
+
+# How a setting of torch is read, and how it is set.
+_Setting = tuple[Callable[[], Any], Callable[[Any], object]]
+
+# The older functions set the newer precisions too, and refuse to tell what these were set to by themselves.
+_all_products: list[Any] = [torch.backends] if hasattr(torch.backends, "fp32_precision") else []
+_newer: list[_Setting] = [(partial(getattr, kind, "fp32_precision"), partial(setattr, kind, "fp32_precision")) for kind in _all_products]
+_newer += [(setting.read, setting.write) for setting in _precisions()]
+
+# What a module may set for all of torch, most often at its top.
+_settings: list[_Setting] = [
+    (torch.get_default_dtype, torch.set_default_dtype),
+    *_newer,
+    (_older_precision, _set_older_precision),
+    *_newer,
     (torch.get_default_device, _set_default_device),
     (torch.get_num_threads, torch.set_num_threads),
     (torch.is_grad_enabled, torch.set_grad_enabled),

@@ -24,12 +24,13 @@ def values_of(data: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, An
     these to a frame of another size.
     """
     data, frame = _stated(data), _stated(frame)
-    if not any(key in data for key in OF_NERFSTUDIO) or any(frame[key] != data[key] for key in SIZE if key in frame and key in data):
-        others = [key for key in FOCAL if FOCAL[0] in frame or FOCAL[1] in frame]  # of the file, which are of another lens
-        return {**{key: value for key, value in data.items() if key not in others}, **frame}
-    shared = [key for key in SHARED if key in data]
-    shared += SHARED_DISTORTION if any(key in data for key in SHARED_DISTORTION) else []
-    return {**data, **{key: value for key, value in frame.items() if key not in shared}}
+    shared: list[str] = []
+    if any(key in data for key in OF_NERFSTUDIO) and all(frame[key] == data[key] for key in SIZE if key in frame and key in data):
+        shared = [key for key in SHARED if key in data]
+        shared += SHARED_DISTORTION if any(key in data for key in SHARED_DISTORTION) else []
+    has_lens = any(key in frame and key not in shared for key in FOCAL[:2])
+    others = [key for key in FOCAL if has_lens and key not in shared]  # of the file, which are of another lens
+    return {**{key: value for key, value in data.items() if key not in others}, **{key: value for key, value in frame.items() if key not in shared}}
 
 
 def overruled(data: Mapping[str, Any], frame: Mapping[str, Any]) -> bool:

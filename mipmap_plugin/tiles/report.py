@@ -11,6 +11,7 @@ from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.adaptation.optimization.amount import fewer_note
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.report import Report, filters, simulated, versions
+from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.models.mip import unread
 from mipmap_plugin.tiles.scene import TiledScene
@@ -38,7 +39,7 @@ def make_report(
     return Report(
         scale=scene.scale,
         base=scene.digest,
-        inputs=scene.wrapped.asked,
+        inputs=scene.wrapped.asked | network_input(config.upsampler),
         cameras_from=scene.wrapped.cameras_from,
         orbit=scene.viewpoints.orbit,
         settings=config,

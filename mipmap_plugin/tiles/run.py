@@ -14,6 +14,7 @@ import torch
 
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report
 from mipmap_plugin.adaptation.shown import refuse_blind, remarks, too_unlike
+from mipmap_plugin.adaptation.target.detail import unused_upsampler
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.errors import BackendUnavailable, JobsFailed, SceneError, SettingsError
 from mipmap_plugin.formats.atomic import delete, new_file, together, write_json
@@ -112,7 +113,7 @@ def _examine_views(jobs: Sequence[Job]) -> None:
         model, views, near = scene.wrapped.model, scene.views.adapted, scene.base_effects.near_plane
         refuse_blind(views, model, near, partial(draw_base, scene), scene.scale)
         orbit = not scene.wrapped.cameras or scene.config.views == "orbit"
-        for remark in filter(None, [*remarks(views, model, near, orbit=orbit), too_unlike(views)]):
+        for remark in filter(None, [*remarks(views, model, near, orbit=orbit), too_unlike(views), unused_upsampler(scene.config, scene.scale)]):
             warn(remark)
 
 

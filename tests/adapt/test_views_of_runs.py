@@ -65,26 +65,32 @@ def test_lenses_that_differ_too_much_are_told_of(times, recwarn):
 def test_views_that_lose_while_the_others_gain_are_told_of_with_their_lenses():
     """Two of four lose, both through lenses of three times the focal length."""
     views = [replace(view, fx=times * view.fx, fy=times * view.fy) for view, times in zip(tiny.cameras(4), (1, 3, 1, 3), strict=True)]
-    [told] = worse_views(views, [20.0, 36.0, 20.0, 30.0], [30.0, 28.0, 30.0, 29.0])
-    assert told.startswith("in 2 of the 4 views that it was chosen by, the file looks worse than the base, by up to 8.0 dB")
+    [told] = worse_views(views, [20.0, 36.0, 20.0, 30.0], [30.0, 28.0, 30.0, 29.0], 1 / 4)
+    assert told.startswith("in 2 of the 4 views that it was chosen by, the file for x0.25 looks worse than the base, by up to 8.0 dB")
     assert f"of {3 * views[0].fx:.0f} px and more, where the shortest has {views[0].fx:.0f} px: adapt with the cameras of each lens" in told
 
 
 def test_the_report_tells_of_longer_lenses_that_the_file_suits_less_than_the_base():
     views = [replace(view, fx=times * view.fx, fy=times * view.fy) for view, times in zip(tiny.cameras(8), (1, 8) * 4, strict=True)]
-    with pytest.warns(UserWarning, match="the file looks worse than the base.* longer lenses") as told:
+    with pytest.warns(UserWarning, match="the file for x0.25 looks worse than the base.* longer lenses") as told:
         report = wrap_model(tiny.model(20), cameras=views).adapt(1 / 4, recipe="instant").report
     assert [note for note in report.notes if note in {str(each.message) for each in told}]
 
 
 def test_lenses_are_not_blamed_where_the_views_that_lose_have_the_same():
-    [told] = worse_views(tiny.cameras(2), [20.0, 36.0], [30.0, 28.0])
+    [told] = worse_views(tiny.cameras(2), [20.0, 36.0], [30.0, 28.0], 1 / 4)
     assert told.endswith("(36.0 -> 28.0), though it gains by their mean")
+
+
+def test_the_zooms_of_a_band_are_no_lenses():
+    """All views of a level have the same lens, and lie at different zooms."""
+    [told] = worse_views([view.zoomed(zoom) for view, zoom in zip(tiny.cameras(2), (0.5, 2), strict=True)], [20.0, 36.0], [30.0, 28.0], 1 / 4)
+    assert told.endswith("though it gains by their mean")
 
 
 @pytest.mark.parametrize("after", [[21.0, 36.0], [20.0, 35.95], [21.0, 30.0]])
 def test_nothing_is_told_of_views_where_none_loses_or_their_mean_does(after):
-    assert worse_views(tiny.cameras(2), [20.0, 36.0], after) == []
+    assert worse_views(tiny.cameras(2), [20.0, 36.0], after, 1 / 4) == []
 
 
 def test_a_scene_nearer_than_the_near_plane_is_refused_with_what_to_do():

@@ -4,6 +4,7 @@ import json
 import re
 import shlex
 
+import anchor_checkpoints
 import numpy as np
 import pytest
 import tiny
@@ -14,6 +15,7 @@ from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.evaluation import viewer_differences
 from mipmap_plugin.formats.ply import read_ply, write_ply
 from mipmap_plugin.models import load_model
+from mipmap_plugin.scenes import write_cameras
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
@@ -130,6 +132,14 @@ def test_inspect_says_how_far_viewers_are_from_training(run, model_folder):
 def test_numbers_and_colors_are_told_in_words(run, tmp_path):
     out = run("inspect", tiny.ply(tmp_path / "a.ply", count=1200), "--no-viewers")[1]
     assert "splats:       1,200\n" in out and ", background black\n" in out
+
+
+def test_splats_of_an_adapted_file_are_counted_at_its_scale_as_adapt_does(run, tmp_path):
+    """At x1 levels of detail show more than twice as many."""
+    anchor_checkpoints.write(tmp_path / "base", anchor_checkpoints.Layout("octree"), count=80)
+    cameras = ["--cameras", write_cameras(tmp_path / "cameras.json", tiny.cameras(6)), "--json"]
+    [report] = json.loads(run("adapt", tmp_path / "base", "--scale", "1/4", "--steps", "1", *cameras)[1])
+    assert json.loads(run("inspect", tmp_path / "base_x0.25", *cameras)[1])["splats"] == report["gaussians_after"]
 
 
 def test_inspect_says_what_it_knows_before_it_draws(run, model_folder, monkeypatch, capsys):

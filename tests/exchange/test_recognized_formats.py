@@ -110,6 +110,14 @@ def test_what_is_wrong_with_a_gzipped_spz_is_said(tmp_path, tool, content, why):
     assert len(load_model(tmp_path / "a.spz")) == 60
 
 
+def test_a_second_stream_that_begins_where_a_block_of_the_file_ends_is_no_other_thing(tmp_path, tool, monkeypatch):
+    """Of whose two first bytes one is read with the first stream."""
+    content = gzip.compress(SPZ)
+    monkeypatch.setattr("mipmap_plugin.formats.damage.BLOCK", len(content) + 1)
+    (tmp_path / "a.spz").write_bytes(content + gzip.compress(b""))
+    assert len(load_model(tmp_path / "a.spz")) == 60
+
+
 @pytest.mark.parametrize("packed", ["spz", "sog"])
 def test_a_bomb_is_not_unpacked(tmp_path, tool, packed):
     path, content = tmp_path / f"a.{packed}", json.dumps({"version": 2, "means": {"files": ["means_l.webp"]}})

@@ -131,6 +131,13 @@ def test_in_a_file_of_nerfstudio_the_files_lens_wins(tmp_path, own, focal):
     assert (told in scene.notes) == (own == {"k1": 0.5})
 
 
+def test_in_a_file_of_nerfstudio_a_frames_own_lens_has_no_part_of_another(tmp_path):
+    """Its focal length along y was by the file's angle."""
+    data = {"applied_transform": np.eye(4)[:3].tolist(), "camera_angle_x": 0.8, "camera_angle_y": 0.2, "w": 32, "h": 32, "frames": [frame(fl_x=50.0)]}
+    [camera] = read_transforms(write_json(tmp_path / "transforms.json", data)).cameras
+    assert (camera.fx, camera.fy) == (50.0, 50.0)
+
+
 def test_distortion_may_be_a_list(tmp_path):
     """Its numbers were passed over without a word."""
     data = {"distortion_params": [0.1, 0, 0, 0, 0, 0], "k1": 0.3, "fl_x": 9.0, "frames": [frame()]}

@@ -190,6 +190,14 @@ def test_the_command_for_several_scales_skips_what_is_finished(job, capsys):
     assert [report["scale"] for report in reports] == [0.5, 0.25]
 
 
+def test_the_command_skips_what_is_finished_of_a_network_that_tiles_do_not_use(job, tmp_path, capsys):
+    (tmp_path / "net.pth").write_bytes(b"weights")
+    options = ["--steps", "0", "--views", "given", "--tiles", "2", "--scale", "1/2", "--upsampler", str(tmp_path / "net.pth")]
+    words = ["adapt", str(job.base.checkpoint), *options]
+    assert main(words) == 0 and "is not used, because x0.5 is no zoom-in" in capsys.readouterr().err
+    assert main([*words, "--skip-existing"]) == 0 and "finished before" in capsys.readouterr().out
+
+
 def test_the_command_removes_the_lock_of_one_that_was_killed_at_a_further_scale(job):
     """It held those of all its scales."""
     options = ["--steps", "0", "--views", "given", "--tiles", "2", "--scale", "1/2", "--json"]

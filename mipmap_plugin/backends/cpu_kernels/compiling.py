@@ -75,7 +75,7 @@ class _Kernel(CPUDispatcher):
 
 _search = types.Function.get_call_type
 
-# What was found, a signature or that there is none, by function, context and types.
+# What was found, a signature with its implementation or that there is none, by function, context and types.
 _found = {}
 
 
@@ -97,12 +97,15 @@ def _get_call_type(function, context, args, kws):
     key = (function, context, *args)
     if key not in _found:
         try:
-            _found[key] = _search(function, context, args, kws)
+            signature = _search(function, context, args, kws)
+            _found[key] = signature, function.get_impl_key(signature)
         except TypingError as error:
             _found[key] = error.with_traceback(None)
     if isinstance(_found[key], TypingError):
         raise _found[key].with_traceback(None)
-    return _found[key]
+    signature, implementation = _found[key]
+    function._impl_keys[signature.args] = implementation  # where numba keeps that of whoever searched last, with other options perhaps
+    return signature
 
 
 class _Cache(FunctionCache):
