@@ -28,4 +28,4 @@ def brief(scale: float, network: bool) -> dict[str, Any]:
 
 if __name__ == "__main__":
     register_recipe("brief", brief)
-    sys.exit(main(["adapt", *sys.argv[1:], "--recipe", "brief", "--output", "brief.ply"]))  # the command, which knows it now
+    sys.exit(main(["adapt", *sys.argv[1:], "--recipe", "brief"]))  # the command, which knows it now

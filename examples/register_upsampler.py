@@ -30,4 +30,4 @@ def sharp(image: Tensor, size: tuple[int, int]) -> Tensor:
 
 if __name__ == "__main__":
     register_upsampler("sharp", sharp)
-    sys.exit(main(["adapt", *sys.argv[1:], "--upsampler", "sharp", "--output", "sharp.ply"]))  # the command, which knows it now
+    sys.exit(main(["adapt", *sys.argv[1:], "--upsampler", "sharp"]))  # the command, which knows it now

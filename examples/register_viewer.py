@@ -25,4 +25,4 @@ KIOSK = Viewer(
 
 if __name__ == "__main__":
     register_viewer("kiosk", KIOSK)
-    sys.exit(main(["adapt", *sys.argv[1:], "--viewer", "kiosk", "--output", "kiosk.ply"]))  # the command, which knows it now
+    sys.exit(main(["adapt", *sys.argv[1:], "--viewer", "kiosk"]))  # the command, which knows it now
