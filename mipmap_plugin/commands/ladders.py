@@ -83,7 +83,7 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
         bound = _ends_at_once(wrapped, request) if exports.streamed_sog else ""
     if bound:
         raise SettingsError(f"{SINGLE_LEVEL}; give a smaller {bound}, or leave --streamed-sog out")
-    if exports.tiles and not wrapped.model.traits.no_viewer:
+    if exports.tiles:
         refuse_far(output, wrapped.model.parameters(), "leave --tiles out")
     if not wrapped.cameras:
         warnings.warn(NO_CAMERAS, stacklevel=2)
