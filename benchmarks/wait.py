@@ -2,6 +2,7 @@
 
     python benchmarks/wait.py DATA
     python benchmarks/wait.py DATA --before ../checkout-of-the-version-before --scale 1/4
+    python benchmarks/wait.py DATA --before ../checkout-of-the-version-before --steps 1/4=290
 
 DATA holds `checkpoints/bases/lego_200`. Each command is a process of its own, the versions take turns, and of several runs the quickest counts.
 *cold* is the first run after installation, with an empty cache of compiled kernels. Writes wait.json and wait.md.
@@ -37,6 +38,7 @@ def main(
     data: tyro.conf.Positional[Path],
     before: Path | None = None,
     scale: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    steps: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     runs: int = 2,
     output: Path = HERE / "benchmarks" / "results",
 ) -> None:
@@ -46,17 +48,18 @@ def main(
         data: The folder with checkpoints/.
         before: A checkout of another version, to be measured beside this one.
         scale: Scales to adapt lego_200 to; 1/2, 1/4 and 1/8 by default.
+        steps: SCALE=STEPS: also adapt with so many steps, such as end with the dB of the version before.
         runs: Runs of each, of which the quickest counts.
         output: Where the results go.
     """
     versions = {"now": HERE} | ({"before": before.resolve()} if before else {})
     base = data.resolve() / "checkpoints" / "bases" / "lego_200"
     rows: list[dict[str, Any]] = []
-    for what, options in commands(base, scale or ("1/2", "1/4", "1/8")):
+    for what, options in commands(base, scale or ("1/2", "1/4", "1/8"), steps):
         for threads in (1, 2) if "adapt" in what else (1,):
             quickest: dict[str, dict[str, Any]] = {}
             for _ in range(1 if "cold" in what else runs):
-                for version, checkout in versions.items():
+                for version, checkout in versions.items() if "--steps" not in options else [("now", HERE)]:
                     row = {"command": what, "version": version, "threads": threads, **timed(checkout, options, threads, cold="cold" in what)}
                     quickest[version] = min(quickest.get(version, row), row, key=lambda measured: measured["seconds"])
             rows += quickest.values()
@@ -66,14 +69,15 @@ def main(
     (output / "wait.md").write_text("\n".join([INTRO.format(runs=runs), head, *map(line, rows), ""]))
 
 
-def commands(base: Path, scales: tuple[str, ...]) -> list[tuple[str, list[str]]]:
+def commands(base: Path, scales: tuple[str, ...], fewer: tuple[str, ...]) -> list[tuple[str, list[str]]]:
     """What is run, and its options."""
-    adapted = [(f"adapt lego_200 x{scale}", ["adapt", str(base), "--scale", scale, "--json"]) for scale in scales]
+    adapt = {scale: ["adapt", str(base), "--scale", scale, "--json"] for scale in (*scales, "1/8", *(each.split("=")[0] for each in fewer))}
     return [
         ("--help", ["--help"]),
         ("inspect lego_200", ["inspect", str(base)]),
-        *adapted,
-        ("adapt lego_200 x1/8, cold", ["adapt", str(base), "--scale", "1/8", "--json"]),
+        *((f"adapt lego_200 x{scale}", adapt[scale]) for scale in scales),
+        *((f"adapt lego_200 x{scale}, {steps} steps", [*adapt[scale], "--steps", steps]) for scale, steps in (each.split("=") for each in fewer)),
+        ("adapt lego_200 x1/8, cold", adapt["1/8"]),
     ]
 
 
