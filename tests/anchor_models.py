@@ -1,6 +1,7 @@
 """Models of anchors, and how they are compared."""
 
 import anchor_checkpoints as checkpoints
+import anchor_oracle as oracle
 import numpy as np
 import pytest
 import tiny
@@ -39,6 +40,38 @@ def agrees(gaussians, rows) -> None:
     shown = [gaussians.means, gaussians.scales, gaussians.quats, gaussians.opacities, gaussians.sh[:, 0] * C0 + 0.5]
     for part, values in enumerate(shown, start=1):
         np.testing.assert_allclose(values.detach().numpy(), np.array([row[part] for row in rows]), rtol=0, atol=1e-5)
+
+
+def assert_decoded(tmp_path, layout, zoom, count=40) -> None:
+    """As by the formulas, in float64."""
+    view, states = VIEWS[1].zoomed(zoom), checkpoints.weights(layout)
+    appearance = states["appearance"]["embedding.weight"].astype(np.float64).mean(0) if layout.appearance else None
+    rows = oracle.decode(checkpoints.columns(layout, count=count), states, layout, view, appearance)
+    agrees(load(tmp_path, layout, count=count).gaussians(view), rows)
+
+
+def assert_saved(tmp_path, layout) -> None:
+    """Byte for byte, but for the header of the PLY."""
+    model = load(tmp_path, layout)
+    saved = model.copy().save(tmp_path / "saved", provenance={"scale": 0.25})
+    first, second = (place / "point_cloud" / "iteration_30000" for place in (tmp_path / "model", tmp_path / "saved"))
+    assert saved == second / "point_cloud.ply"
+    assert sorted(p.name for p in first.iterdir()) == sorted(p.name for p in second.iterdir())
+    for file in first.iterdir():
+        assert (second / file.name).read_bytes().split(b"end_header")[-1] == file.read_bytes().split(b"end_header")[-1]
+    assert (tmp_path / "saved/cfg_args").read_bytes() == (tmp_path / "model/cfg_args").read_bytes()
+    assert is_same(state_of(model), state_of(load_model(tmp_path / "saved")))
+
+
+def assert_adapts(model, scale, least, steps) -> None:
+    """It gains at least so many dB, moves what may move, and leaves the base as it is."""
+    before = state_of(model)
+    gained, adapted = gain(model, scale, steps=steps)
+    after = state_of(adapted)
+    assert gained > least
+    assert is_same(before, state_of(model))
+    moved = {"features", "scales", *model.shared_parameters(), *(["offsets"] if scale < 1 else [])}
+    assert {name for name in before if not torch.equal(before[name], after[name])} == moved
 
 
 def state_of(model):

@@ -44,6 +44,25 @@ def test_the_report_says_how_a_moving_scene_was_sampled_and_that_of_a_static_one
     assert "time" not in static.report.views
 
 
+FAMILIES = {
+    "deformable": (lambda path: moving.write_deformable(path, moving.deform_state(width=64)), "deform/iteration_40000/deform.pth"),
+    "4dgs": (lambda path: moving.write_hexplane(path, "no_do=False, no_dshs=False"), "point_cloud/iteration_14000/deformation.pth"),
+}
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize(("scale", "settings"), [(1 / 4, dict(steps=15, extra_views=4)), (4, dict(recipe="instant"))])
+def test_adapting_gains_and_leaves_the_network_as_it_was(tmp_path, family, scale, settings):
+    write, network = FAMILIES[family]
+    wrapped = wrap_model(write(tmp_path / "m"))
+    adapted = wrapped.adapt(scale, **settings)
+    base, now = moving.decibels(wrapped, adapted, [moving.at(time) for time in (0.0, 0.5, 1.0)])
+    assert now > base + 1
+    assert "without a time of their own, spread over 0..1" in adapted.report.views
+    adapted.save(tmp_path / "out")
+    assert (tmp_path / "out" / network).read_bytes() == (tmp_path / "m" / network).read_bytes()
+
+
 def test_a_model_on_another_device_moves_as_before(tmp_path):
     model = load_model(moving.write_deformable(tmp_path / "m"))
     assert torch.equal(model.to("cpu").gaussians(moving.at(0.5)).means, model.gaussians(moving.at(0.5)).means)

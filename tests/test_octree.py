@@ -7,7 +7,7 @@ import ply_files
 import pytest
 import torch
 from anchor_checkpoints import STANDARD, VOXEL, Layout
-from anchor_models import VIEWS, agrees, gain, is_same, load, refused, state_of
+from anchor_models import VIEWS, agrees, assert_adapts, assert_decoded, assert_saved, gain, load, refused
 
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.ply import read_ply
@@ -31,11 +31,7 @@ LAYOUTS = {
 @pytest.mark.parametrize("name", LAYOUTS)
 @pytest.mark.parametrize("zoom", [1, 0.5, 3])
 def test_decoding_agrees_with_the_formulas_in_float64(tmp_path, name, zoom):
-    layout, view = LAYOUTS[name], VIEWS[1].zoomed(zoom)
-    states = checkpoints.weights(layout)
-    appearance = states["appearance"]["embedding.weight"].astype(np.float64).mean(0) if layout.appearance else None
-    columns = checkpoints.columns(layout, count=80)
-    agrees(load(tmp_path, layout, count=80).gaussians(view), oracle.decode(columns, states, layout, view, appearance))
+    assert_decoded(tmp_path, LAYOUTS[name], zoom, count=80)
 
 
 def test_zoom_chooses_the_levels_and_size_does_not(tmp_path):
@@ -81,14 +77,7 @@ def test_without_options_shapes_decide_and_ambiguous_ones_are_refused(tmp_path):
 
 @pytest.mark.parametrize(("scale", "least"), [(1 / 4, 0.8), (4, 0.3)])
 def test_adapting_gains_and_leaves_the_base_and_what_is_frozen(tmp_path, scale, least):
-    model = load(tmp_path, LAYOUTS["plain"])
-    before = state_of(model)
-    gained, adapted = gain(model, scale, steps=40)
-    after = state_of(adapted)
-    assert gained > least
-    assert is_same(before, state_of(model))
-    moved = {"features", "scales", *model.shared_parameters(), *(["offsets"] if scale < 1 else [])}
-    assert {name for name in before if not torch.equal(before[name], after[name])} == moved
+    assert_adapts(load(tmp_path, LAYOUTS["plain"]), scale, least, steps=40)
 
 
 def test_the_report_counts_the_splats_of_the_new_scales_levels(tmp_path):
@@ -114,12 +103,7 @@ def test_nothing_is_told_of_levels_where_there_is_one(tmp_path):
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_a_round_trip_repeats_the_rows_and_the_networks_byte_for_byte(tmp_path, name):
-    model = load(tmp_path, LAYOUTS[name])
-    model.copy().save(tmp_path / "saved", provenance={})
-    first, second = (place / "point_cloud" / "iteration_30000" for place in (tmp_path / "model", tmp_path / "saved"))
-    for file in first.iterdir():
-        assert (second / file.name).read_bytes().split(b"end_header")[-1] == file.read_bytes().split(b"end_header")[-1]
-    assert is_same(state_of(model), state_of(load_model(tmp_path / "saved")))
+    assert_saved(tmp_path, LAYOUTS[name])
 
 
 def test_the_constants_survive_the_loss_of_their_rows(tmp_path):

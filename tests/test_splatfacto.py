@@ -129,17 +129,15 @@ def test_the_cameras_of_the_scene_are_carried_into_the_frame_of_the_checkpoint(t
     assert placed.size == camera.size
 
 
-@pytest.mark.parametrize(("downscale", "size"), [("null", (500, 1000)), ("1", (2000, 4000)), ("2", (1000, 2000))])
-def test_large_photographs_were_shrunk_for_the_training(tmp_path, downscale, size):
-    folder = splatfacto_folder(tmp_path / "r", splats(), downscale=downscale)
-    (folder / "dataparser_transforms.json").write_text(json.dumps(TRANSFORMS))
-    [placed] = load_model(folder).as_trained(tiny.cameras(1, width=4000, height=2000), Capture())
-    assert placed.size == size
-
-
-@pytest.mark.parametrize(("downscale", "ratio", "size"), [("2", "0.5", (500, 1000)), ("null", "0.7", (350, 700)), ("2", "null", (1000, 2000))])
-def test_photographs_that_the_datamanager_shrank_are_so_small(tmp_path, downscale, ratio, size):
-    folder = splatfacto_folder(tmp_path / "r", splats(), downscale=f"{downscale}\n    camera_res_scale_factor: {ratio}")
+@pytest.mark.parametrize(
+    ("downscale", "ratio", "size"),
+    [
+        *(("null", None, (500, 1000)), ("1", None, (2000, 4000)), ("2", None, (1000, 2000))),
+        *(("2", "0.5", (500, 1000)), ("null", "0.7", (350, 700)), ("2", "null", (1000, 2000))),  # of the datamanager
+    ],
+)
+def test_photographs_that_were_shrunk_for_the_training_are_so_small(tmp_path, downscale, ratio, size):
+    folder = splatfacto_folder(tmp_path / "r", splats(), downscale=downscale + (f"\n    camera_res_scale_factor: {ratio}" if ratio else ""))
     (folder / "dataparser_transforms.json").write_text(json.dumps(TRANSFORMS))
     [camera] = tiny.cameras(1, width=4000, height=2000)
     [placed] = load_model(folder).as_trained([camera], Capture())

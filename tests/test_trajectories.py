@@ -81,9 +81,9 @@ def test_orbit_poses_are_rotations():
     torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(5, dtype=torch.float64))
 
 
-def test_orbit_is_the_same_only_for_the_same_seed():
-    means = cloud(1, 1, 1)
-    first, again, other = (poses(orbit(means, (64, 64), 6, seeded(seed))) for seed in (1, 1, 2))
+@pytest.mark.parametrize("views", [lambda seed: orbit(cloud(1, 1, 1), (64, 64), 6, seed), lambda seed: jittered(ring(), 6, seed)])
+def test_views_are_the_same_only_for_the_same_seed(views):
+    first, again, other = (poses(views(seeded(seed))) for seed in (1, 1, 2))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
@@ -242,12 +242,6 @@ def test_views_are_spread_over_the_times_of_the_cameras_too():
     cameras = [replace(camera, time=float(n % 2)) for n, camera in enumerate(ring(12))]
     times = [view.time for view in jittered(cameras, 40, seeded())]
     assert 8 <= sum(times) <= 32
-
-
-def test_jittered_is_the_same_only_for_the_same_seed():
-    first, again, other = (poses(jittered(ring(), 6, seeded(seed))) for seed in (1, 1, 2))
-    assert torch.equal(first, again)
-    assert not torch.equal(first, other)
 
 
 def test_views_around_thousands_of_cameras_need_no_number_for_each_pair(monkeypatch):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from anchor_checkpoints import Layout
-from anchor_models import VIEWS, gain, is_same, state_of
+from anchor_models import VIEWS, assert_adapts, gain, is_same, state_of
 
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import SettingsError, ShapeError
@@ -23,14 +23,7 @@ pytestmark = pytest.mark.usefixtures("few_views")
 
 @pytest.mark.parametrize(("scale", "least"), [(1 / 4, 1.0), (4, 4.0)])
 def test_adapting_gains_and_leaves_the_base_and_what_is_frozen(folder, scale, least):
-    model = load_model(folder)
-    before = state_of(model)
-    gained, adapted = gain(model, scale, steps=30 if scale < 1 else 5)
-    after = state_of(adapted)
-    assert gained > least
-    assert is_same(before, state_of(model))
-    moved = {"features", "scales", *model.shared_parameters(), *(["offsets"] if scale < 1 else [])}
-    assert {name for name in before if not torch.equal(before[name], after[name])} == moved
+    assert_adapts(load_model(folder), scale, least, steps=30 if scale < 1 else 5)
 
 
 def test_networks_that_move_gain_more_than_those_that_a_rate_of_0_keeps(folder):

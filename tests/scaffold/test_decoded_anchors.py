@@ -9,7 +9,7 @@ import ply_files
 import pytest
 import torch
 from anchor_checkpoints import Layout
-from anchor_models import LAYOUTS, VIEWS, agrees, load, refused
+from anchor_models import LAYOUTS, VIEWS, agrees, assert_decoded, load, refused
 
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.ply import read_ply
@@ -25,10 +25,7 @@ pytestmark = pytest.mark.usefixtures("few_views")
 @pytest.mark.parametrize("name", LAYOUTS)
 @pytest.mark.parametrize("zoom", [1, 0.25])
 def test_decoding_agrees_with_the_formulas_in_float64(tmp_path, name, zoom):
-    layout, view = LAYOUTS[name], VIEWS[1].zoomed(zoom)
-    states = checkpoints.weights(layout)
-    appearance = states["appearance"]["embedding.weight"].astype(np.float64).mean(0) if layout.appearance else None
-    agrees(load(tmp_path, layout).gaussians(view), oracle.decode(checkpoints.columns(layout), states, layout, view, appearance))
+    assert_decoded(tmp_path, LAYOUTS[name], zoom)
 
 
 def test_a_training_view_sees_its_own_appearance(tmp_path):

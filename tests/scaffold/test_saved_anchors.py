@@ -3,7 +3,7 @@
 import anchor_checkpoints as checkpoints
 import pytest
 import torch
-from anchor_models import LAYOUTS, is_same, load, state_of
+from anchor_models import LAYOUTS, assert_saved, is_same, load, state_of
 
 from mipmap_plugin.errors import OutputExists
 from mipmap_plugin.formats.ply import read_ply
@@ -14,16 +14,7 @@ pytestmark = pytest.mark.usefixtures("few_views")
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_a_round_trip_repeats_the_rows_and_the_networks_byte_for_byte(tmp_path, name):
-    model = load(tmp_path, LAYOUTS[name])
-    saved = model.copy().save(tmp_path / "saved", provenance={"scale": 0.25})
-    first, second = (place / "point_cloud" / "iteration_30000" for place in (tmp_path / "model", tmp_path / "saved"))
-    assert saved == second / "point_cloud.ply"
-    assert sorted(p.name for p in first.iterdir()) == sorted(p.name for p in second.iterdir())
-    for file in first.iterdir():
-        old, new = file.read_bytes(), (second / file.name).read_bytes()
-        assert new.split(b"end_header")[-1] == old.split(b"end_header")[-1]
-    assert (tmp_path / "saved/cfg_args").read_bytes() == (tmp_path / "model/cfg_args").read_bytes()
-    assert is_same(state_of(model), state_of(load_model(tmp_path / "saved")))
+    assert_saved(tmp_path, LAYOUTS[name])
 
 
 def test_the_original_reader_finds_its_columns(folder, tmp_path):
