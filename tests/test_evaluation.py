@@ -223,15 +223,9 @@ def test_a_markdown_table_pads_its_columns():
     assert markdown(["a", "long"], [["123", "4"]]) == "| a   | long |\n| --- | ---- |\n| 123 | 4    |"
 
 
-def test_a_viewer_that_cannot_be_adapted_for_is_refused_before_anything_is_drawn(scene, monkeypatch):
-    own = wrap_model(tiny.model(trained=TrainedScale(keeps_filter=True)), cameras=tiny.cameras())
+@pytest.mark.parametrize(("settings", "said"), [({"viewer": "spark"}, "leave the viewer spark out"), ({"steps": -1}, "setting steps")])
+def test_what_cannot_be_adapted_to_is_refused_before_anything_is_drawn(scene, monkeypatch, settings, said):
+    base = wrap_model(tiny.model(trained=TrainedScale(keeps_filter=True)), cameras=tiny.cameras())
     monkeypatch.setattr(Wrapped, "render", None)
-    with pytest.raises(SettingsError, match="leave the viewer spark out"):
-        evaluate(own, scene, [1 / 4], ["instant"], "P3", viewer="spark")
-
-
-def test_a_setting_out_of_range_is_refused_before_anything_is_drawn(scene, monkeypatch):
-    base = wrap_model(tiny.model(), cameras=tiny.cameras())
-    monkeypatch.setattr(Wrapped, "render", None)
-    with pytest.raises(SettingsError, match="setting steps"):
-        evaluate(base, scene, [1 / 4], ["default"], "P3", steps=-1)
+    with pytest.raises(SettingsError, match=said):
+        evaluate(base, scene, [1 / 4], ["default"], "P3", **settings)

@@ -8,14 +8,13 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin import register_backend, register_model, register_recipe, register_upsampler, register_viewer, wrap_model
+from mipmap_plugin import register_backend, register_recipe, register_upsampler, register_viewer, wrap_model
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.backends.conformance import CASES, check_backend, summary
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import PluginError, SettingsError
-from mipmap_plugin.models import API_VERSION, CERTAIN, Family, Match
 from mipmap_plugin.recipes import default
 from mipmap_plugin.render_settings import EvenBuckets, Packing, RenderSettings
 from mipmap_plugin.splatting.viewers import Viewer, single_viewers
@@ -290,7 +289,3 @@ def test_a_viewer_that_cannot_be_loaded_hides_no_other():
 def test_an_empty_list_of_cameras_is_no_wish_for_an_orbit(cameras):
     with pytest.raises(SettingsError, match="cameras: there are none"):
         wrap_model(tiny.model(), cameras=tiny.cameras(2)).adapt(0.5, cameras=cameras)
-
-
-def test_a_claim_is_still_believed():
-    register_model("theirs", Family("theirs", "Theirs", lambda files: Match(CERTAIN, "it says so"), API_VERSION))

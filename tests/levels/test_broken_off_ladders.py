@@ -97,14 +97,6 @@ def interrupt():
     raise Interrupted("Ctrl-C")
 
 
-def test_a_ladder_that_failed_before_its_first_level_is_in_nobodys_way(tmp_path, monkeypatch):
-    base = wrapped()
-    monkeypatch.setattr(base, "adapt", lambda *_, **__: interrupt())
-    with pytest.raises(Interrupted):
-        make_levels(base, request(), resume=tmp_path / "state")
-    assert make_levels(wrapped(), request(coarsest=0.6), resume=tmp_path / "state").levels
-
-
 @pytest.mark.parametrize("by", ["zoom", "distance"])
 def test_a_ladder_that_failed_before_its_first_level_leaves_nothing(tmp_path, monkeypatch, by):
     base = wrapped()

@@ -128,19 +128,12 @@ def test_levels_for_mip_splatting_start_from_finer_ones_that_are_kept(tmp_path):
 
 
 @pytest.mark.parametrize("has_cameras", [True, False])
-def test_levels_of_generated_views_are_said_to_be(tmp_path, capsys, has_cameras):
+def test_the_command_tells_of_generated_views_and_the_size_of_a_small_level_in_kilobytes(tmp_path, capsys, has_cameras):
     base = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12)) if has_cameras else tiny.ply(tmp_path / "base.ply")
     words = ["levels", str(base), "--viewer", "classic", "--output", str(tmp_path / "ladder"), "--coarsest", "1"]
     assert cli.main([*words, "--backend", "cpu", "--threads", "1"]) == 0
-    assert ("no cameras are known" in capsys.readouterr().err) is not has_cameras
-
-
-def test_the_size_of_a_small_level_is_told_in_kilobytes(tmp_path, capsys):
-    base, ladder = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12)), tmp_path / "ladder"
-    words = ["levels", str(base), "--viewer", "classic", "--output", str(ladder), "--coarsest", "1"]
-    assert cli.main([*words, "--backend", "cpu", "--threads", "1"]) == 0
-    size = json.loads((ladder / "levels.json").read_text())["levels"][0]["bytes"]
-    assert f" splats, {size / 1e3:.0f} kB, " in capsys.readouterr().out
+    said, size = capsys.readouterr(), json.loads((tmp_path / "ladder/levels.json").read_text())["levels"][0]["bytes"]
+    assert ("no cameras are known" in said.err) is not has_cameras and f" splats, {size / 1e3:.0f} kB, " in said.out
 
 
 def test_a_ladder_in_memory_keeps_no_truths():

@@ -101,26 +101,33 @@ def test_only_views_that_steps_use_are_drawn():
     assert views_of(views, config(steps=12, time_budget_s=1.0), 0, 6) == views
 
 
+@pytest.fixture
+def measured(halved, monkeypatch):
+    """Give the scene a start of 30 dB, and the PSNRs that its states are then measured to have."""
+
+    def give(*psnrs):
+        each = iter(psnrs)
+        torch.save({"name": "the start", "psnr": 30.0}, halved.folder / "start.pt")
+        monkeypatch.setattr(steering, "psnr", lambda *_: next(each))
+        monkeypatch.setattr(steering, "open_state", lambda *_: None)
+
+    return give
+
+
 @pytest.mark.parametrize(
     ("psnrs", "kept", "ceiling"),
     [((31.0, 32.0), 2, 1.0), ((31.0, 30.95), 2, 1.0), ((31.0, 30.0), 1, 0.5), ((29.0,), 0, 0.5)],
 )
-def test_what_does_harm_to_the_whole_is_undone(halved, monkeypatch, psnrs, kept, ceiling):
-    torch.save({"name": "the start", "psnr": 30.0}, halved.folder / "start.pt")
-    measured = iter(psnrs)
-    monkeypatch.setattr(steering, "psnr", lambda *_: next(measured))
-    monkeypatch.setattr(steering, "open_state", lambda *_: None)
+def test_what_does_harm_to_the_whole_is_undone(halved, measured, monkeypatch, psnrs, kept, ceiling):
+    measured(*psnrs)
     monkeypatch.setattr(steering, "rate_factor", lambda *_: 1.0)
     steering.steer(halved, Sweep(0, 0, (1, 2), 0, 0))
     after = Steered.before(halved.folder, 1)
     assert (max(after.step, 0), after.ceiling, tuple(after.psnrs)) == (kept, ceiling, psnrs)
 
 
-def test_a_little_loss_in_the_warm_up_is_no_harm_and_it_is_not_repeated(halved, monkeypatch):
-    torch.save({"name": "the start", "psnr": 30.0}, halved.folder / "start.pt")
-    measured = iter([32.0, 31.0, 29.0])
-    monkeypatch.setattr(steering, "psnr", lambda *_: next(measured))
-    monkeypatch.setattr(steering, "open_state", lambda *_: None)
+def test_a_little_loss_in_the_warm_up_is_no_harm_and_it_is_not_repeated(halved, measured, monkeypatch):
+    measured(32.0, 31.0, 29.0)
     monkeypatch.setattr(halved, "config", halved.config.model_copy(update={"warm_up": 1.0}))
     steering.steer(halved, Sweep(0, 0, (1, 2, 3), 0, 0))
     after = Steered.before(halved.folder, 1)
@@ -128,11 +135,8 @@ def test_a_little_loss_in_the_warm_up_is_no_harm_and_it_is_not_repeated(halved, 
     assert after.following is None or not after.following.repeats
 
 
-def test_what_did_harm_is_done_again_in_front_of_the_same_halos_but_not_for_ever(halved, monkeypatch):
-    torch.save({"name": "the start", "psnr": 30.0}, halved.folder / "start.pt")
-    measured = iter([31.0, 29.0, 29.0, 29.0, 32.0, 29.0, 33.0])
-    monkeypatch.setattr(steering, "psnr", lambda *_: next(measured))
-    monkeypatch.setattr(steering, "open_state", lambda *_: None)
+def test_what_did_harm_is_done_again_in_front_of_the_same_halos_but_not_for_ever(halved, measured, monkeypatch):
+    measured(31.0, 29.0, 29.0, 29.0, 32.0, 29.0, 33.0)
     monkeypatch.setattr(steering, "rate_factor", lambda scene, step, ceiling: ceiling)
     monkeypatch.setitem(halved.__dict__, "sweeps", [Sweep(0, 0, (1, 2, 3), 0, 0), Sweep(1, 3, (4,), 1, 1)])
     made, sweep = [], sweep_of(halved, 0)
@@ -150,12 +154,9 @@ def test_what_did_harm_is_done_again_in_front_of_the_same_halos_but_not_for_ever
     ]
 
 
-def test_what_a_sweep_is_measured_by_is_what_it_began_with(halved, monkeypatch):
+def test_what_a_sweep_is_measured_by_is_what_it_began_with(halved, measured):
     """A warm-up may lose a little, and what comes after it need not be better than the best of it."""
-    torch.save({"name": "the start", "psnr": 30.0}, halved.folder / "start.pt")
-    monkeypatch.setattr(steering, "open_state", lambda *_: None)
-    measured = iter([32.0, 31.0, 31.5, 31.45])
-    monkeypatch.setattr(steering, "psnr", lambda *_: next(measured))
+    measured(32.0, 31.0, 31.5, 31.45)
     halved.config = halved.config.model_copy(update={"warm_up": 0.5})
     steering.steer(halved, Sweep(0, 0, (1, 2), 0, 0))
     assert Steered.before(halved.folder, 1).psnr == 31.0
