@@ -33,6 +33,15 @@ def pictures(size: int = 8) -> list[Picture]:
     return [Picture(title, role, noise, {"psnr_db": 20.0}, {"psnr_db": 21.0}) for role, title in TITLES.items()]
 
 
+def fill(gallery, base, names, **settings):
+    """Show what each name of a row is for: one view of the base, and an adaptation to x1/2 by it where it is none of the base."""
+    camera, truth = base.cameras[0], base.render(base.cameras[0]).image
+    for name in names:
+        if not name.startswith(("base", "supersampling")):
+            gallery.adapted(name, base.adapt(1 / 2, recipe="instant", **settings))
+        gallery.shot(Shot(name, "ball", 1 / 2, camera, truth, truth, 20.0, None, None))
+
+
 class OfFewSettings(ReferenceBackend):
     """As those of a GPU: it has no viewer's cut-offs."""
 
@@ -92,12 +101,9 @@ def test_the_page_of_evaluate_has_the_figures_of_its_json(model_folder, tmp_path
 def test_a_file_for_a_viewer_is_compared_with_the_base_in_that_viewer(model_folder):
     pytest.importorskip("numba")
     base = wrap_model(model_folder, backend="cpu")
-    camera, gallery = base.cameras[0], Gallery(base, "itself")
-    truth = base.render(camera).image
-    for row in ("base", "base in spark", "base, resized", "supersampling, 2 x 2", "instant, held out", "instant, scored"):
-        if row.startswith("instant"):
-            gallery.adapted(row, base.adapt(1 / 2, recipe="instant", viewer="spark"))
-        gallery.shot(Shot(row, "ball", 1 / 2, camera, truth, truth, 20.0, None, None))
+    gallery = Gallery(base, "itself")
+    names = ("base", "base in spark", "base, resized", "supersampling, 2 x 2", "instant, held out", "instant, scored")
+    fill(gallery, base, names, viewer="spark")
     [zoom] = gallery.zooms([], named=True)
     assert zoom.label == "ball ×1/2"
     roles = {picture.name: picture.role for picture in zoom.pictures}
@@ -110,12 +116,8 @@ def test_a_file_for_a_viewer_is_compared_with_the_base_in_that_viewer(model_fold
 
 def test_a_file_for_several_viewers_is_told_of_by_the_worst_of_them(model_folder):
     base = wrap_model(model_folder)
-    camera, gallery = base.cameras[0], Gallery(base, "itself")
-    truth, row = base.render(camera).image, Row("", 1 / 2, "P3", 20.0, None, 3.0, 1.0, 9, scene="ball")
-    for name in ("base in spark", "base in classic", "instant in spark", "instant in classic"):
-        if name.startswith("instant"):
-            gallery.adapted(name, base.adapt(1 / 2, recipe="instant"))
-        gallery.shot(Shot(name, "ball", 1 / 2, camera, truth, truth, 20.0, None, None))
+    gallery, row = Gallery(base, "itself"), Row("", 1 / 2, "P3", 20.0, None, 3.0, 1.0, 9, scene="ball")
+    fill(gallery, base, ("base in spark", "base in classic", "instant in spark", "instant in classic"))
     rows = [replace(row, name="base in classic, worst of 2"), replace(row, name="instant in spark, worst of 2", psnr_db=30.0)]
     page = evaluation_page("ball", [gallery], rows, commands=())
     assert page.lead == "×1/2 in the worst of 2 viewers: 20.0 dB as it is, 30.0 dB adapted in 3.0 s."
@@ -126,12 +128,8 @@ def test_the_page_of_the_demo_does_not_say_that_adapted_is_adapted(monkeypatch):
     pytest.importorskip("numba")
     monkeypatch.setattr("mipmap_plugin.pages.in_viewers.VIEWERS", ("classic",))
     base = wrap_model(tiny.model(), cameras=tiny.cameras(3), backend="cpu")
-    camera, gallery = base.cameras[0], Gallery(base, "the ray-traced world")
-    truth = base.render(camera).image
-    for name in ("base", "adapted"):
-        if name == "adapted":
-            gallery.adapted(name, base.adapt(1 / 2, recipe="instant"))
-        gallery.shot(Shot(name, "ball", 1 / 2, camera, truth, truth, 20.0, None, None))
+    gallery = Gallery(base, "the ray-traced world")
+    fill(gallery, base, ("base", "adapted"))
     [zoom] = gallery.zooms([Row(name, 1 / 2, "P3", 20.0, None, 3.0, 1.0, 9, scene="ball") for name in ("base", "adapted")])
     assert zoom.viewers and zoom.in_viewers == ""
 
@@ -140,14 +138,11 @@ def test_the_page_tells_of_the_default_recipe_by_name_in_whatever_order_recipes_
     pytest.importorskip("numba")
     monkeypatch.setattr("mipmap_plugin.pages.in_viewers.VIEWERS", ("classic",))
     base = wrap_model(tiny.model(), cameras=tiny.cameras(3), backend="cpu")
-    camera, gallery = base.cameras[0], Gallery(base, "itself", ["instant", "default"])
-    truth, row = base.render(camera).image, Row("base", 1 / 2, "P3", 20.0, None, 3.0, 1.0, 9, scene="ball")
+    gallery, row = Gallery(base, "itself", ["instant", "default"]), Row("base", 1 / 2, "P3", 20.0, None, 3.0, 1.0, 9, scene="ball")
     names = ["base", "instant, held out", "default, held out", "default, scored"]
     rows = [replace(row, name=name, psnr_db=20.0 + 5 * number) for number, name in enumerate(names)]
     for name in names:
-        if name != "base":
-            gallery.adapted(name, base.adapt(1 / 2, recipe="instant"))
-        gallery.shot(Shot(name, "ball", 1 / 2, camera, truth, truth, 20.0, None, None))
+        fill(gallery, base, [name])
         page = evaluation_page("ball", [gallery], rows, commands=())
         if name == "instant, held out":
             assert page.lead == "×1/2: 20.0 dB as it is, 25.0 dB adapted by instant in 3.0 s."

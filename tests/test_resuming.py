@@ -53,6 +53,13 @@ def stopped(words, number, cells, at_least):
     return process.returncode, said
 
 
+def rows_of(folder, *options):
+    """The rows of an evaluation by a command that writes them anew, and keeps its cells."""
+    words = ["evaluate", str(folder / "base"), "--images", str(folder / "scene"), "--scale", "1/2", *options]
+    assert main([*words, "--output", str(folder / "rows.json"), "--overwrite"]) == 0
+    return json.loads((folder / "rows.json").read_text())["rows"]
+
+
 def untimed(rows):
     return [{name: value for name, value in row.items() if name not in ("adapt_seconds", "ms_per_view")} for row in rows]
 
@@ -97,25 +104,21 @@ def test_a_folder_with_other_things_is_not_deleted(folder, capsys, command):
 def test_rows_of_another_background_are_measured_again(folder, monkeypatch):
     """Which is not in the checkpoint's own bytes."""
     monkeypatch.setattr("mipmap_plugin.commands.evaluate.shutil", SimpleNamespace(rmtree=lambda *_, **__: None))
-    words = ["evaluate", str(folder / "base"), "--images", str(folder / "scene"), "--scale", "1/2"]
     psnrs = []
     for white in (False, True):
         options = folder / "base" / "cfg_args"
         options.write_text(options.read_text().replace("white_background=False", f"white_background={white}"))
-        assert main([*words, "--output", str(folder / "rows.json"), "--overwrite"]) == 0
-        psnrs.append(json.loads((folder / "rows.json").read_text())["rows"][0]["psnr_db"])
+        psnrs.append(rows_of(folder)[0]["psnr_db"])
     assert psnrs[0] != psnrs[1]
 
 
 def test_rows_of_another_truth_are_measured_again(folder, monkeypatch):
     """As of an older version, whose protocol made another of the same photographs."""
     monkeypatch.setattr("mipmap_plugin.commands.evaluate.shutil", SimpleNamespace(rmtree=lambda *_, **__: None))
-    words = ["evaluate", str(folder / "base"), "--images", str(folder / "scene"), "--scale", "1/2", "--protocol", "P1"]
     rows = []
     for truncate in (False, True, True):
         monkeypatch.setitem(PROTOCOLS, "P1", replace(PROTOCOLS["P1"], truncate=truncate))
-        assert main([*words, "--output", str(folder / "rows.json"), "--overwrite"]) == 0
-        rows.append(json.loads((folder / "rows.json").read_text())["rows"][0])
+        rows.append(rows_of(folder, "--protocol", "P1")[0])
     assert rows[0]["psnr_db"] != rows[1]["psnr_db"] and rows[1] == rows[2]  # the last is not measured again
 
 

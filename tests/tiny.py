@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -61,13 +62,18 @@ def folder(path: Path, views: list[Camera] | None = None, **options) -> Path:
 
 def scene(path: Path, test: list[Camera] | None = None, train: list[Camera] | None = None, **options) -> Path:
     """A transforms scene with photographs, which are exact renders of the model at the size of each camera."""
-    splats, painter = model(**options), ReferenceBackend()
+    splats = model(**options)
     for split, views in (("train", train or []), ("test", test or cameras(2, seed=9, split="test"))):
-        frames = []
-        for view in views:
-            pose = torch.linalg.inv(view.viewmat) @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-            frames.append({"file_path": f"./{split}/{view.name}", "transform_matrix": pose.tolist(), "fl_x": view.fx, "fl_y": view.fy})
-            write_image(path / split / f"{view.name}.png", painter.render(splats.gaussians(view), view, Effects(1)).image)
-        if frames:
-            (path / f"transforms_{split}.json").write_text(json.dumps({"frames": frames}))
+        write_photographs(path, split, views, lambda view: ReferenceBackend().render(splats.gaussians(view), view, Effects(1)).image)
     return path
+
+
+def write_photographs(path: Path, split: str, views: list[Camera], draw: Callable[[Camera], torch.Tensor]) -> None:
+    """The photographs of a part of a transforms scene, and their cameras; none without views."""
+    frames = []
+    for view in views:
+        pose = torch.linalg.inv(view.viewmat) @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+        frames.append({"file_path": f"./{split}/{view.name}", "transform_matrix": pose.tolist(), "fl_x": view.fx, "fl_y": view.fy})
+        write_image(path / split / f"{view.name}.png", draw(view))
+    if frames:
+        (path / f"transforms_{split}.json").write_text(json.dumps({"frames": frames}))

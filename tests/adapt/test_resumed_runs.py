@@ -62,14 +62,17 @@ def test_a_resumed_paper_run_equals_an_uninterrupted_one(tmp_path, ctrl_c, nth, 
     assert files[0] == files[1]
 
 
-def test_a_run_interrupted_twice_equals_an_uninterrupted_one(tmp_path, ctrl_c):
-    whole = wrapped().adapt(1 / 4, **BRIEF)
-    for _ in range(2):
+@pytest.mark.parametrize(("merging", "times"), [({}, 2), ({"merge_to": 0.5, "merging_costs": 9.0}, 1)])
+def test_a_run_that_is_interrupted_once_or_twice_equals_an_uninterrupted_one(tmp_path, ctrl_c, merging, times):
+    settings = BRIEF | merging
+    whole = wrapped().adapt(1 / 4, **settings)
+    for _ in range(times):
         ctrl_c(2)
         with pytest.raises(Interrupted):
-            wrapped().adapt(1 / 4, resume=tmp_path / "state", **BRIEF)
-    resumed = wrapped().adapt(1 / 4, resume=tmp_path / "state", **BRIEF)
+            wrapped().adapt(1 / 4, resume=tmp_path / "state", **settings)
+    resumed = wrapped().adapt(1 / 4, resume=tmp_path / "state", **settings)
     assert torch.equal(shown(resumed), shown(whole))
+    assert not merging or resumed.report.gaussians_after < resumed.report.gaussians_before
 
 
 def test_a_resumed_run_tells_the_seconds_of_both_processes(tmp_path, ctrl_c, monkeypatch):
@@ -102,17 +105,6 @@ def test_a_resumed_run_goes_on_as_planned(tmp_path, ctrl_c, monkeypatch):
     assert (saved["planned"], saved["reserved"]) == (BRIEF["steps"], 0.5)
     resumed = wrapped().adapt(1 / 4, resume=tmp_path / "state", **settings).report
     assert resumed.ended_by == f"{BRIEF['steps']} steps" and resumed.curve[-1].step == BRIEF["steps"]
-
-
-def test_a_resumed_run_merges_as_the_whole_one_did(tmp_path, ctrl_c):
-    merging = {**BRIEF, "merge_to": 0.5, "merging_costs": 9.0}
-    whole = wrapped().adapt(1 / 4, **merging)
-    ctrl_c(3)
-    with pytest.raises(Interrupted):
-        wrapped().adapt(1 / 4, resume=tmp_path / "state", **merging)
-    resumed = wrapped().adapt(1 / 4, resume=tmp_path / "state", **merging)
-    assert resumed.report.gaussians_after < resumed.report.gaussians_before
-    assert torch.equal(shown(resumed), shown(whole))
 
 
 def test_extra_columns_outlive_a_resumption_unless_splats_were_dropped(tmp_path, ctrl_c):

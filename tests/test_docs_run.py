@@ -1,0 +1,128 @@
+"""What README.md and docs/ show runs: their Python on a scene that adapts in a moment, their commands on the embedded one."""
+
+import ast
+import builtins
+import importlib
+import inspect
+import os
+import shlex
+import shutil
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+import tiny
+from docs_pages import CALLS, COMMANDS, PYTHON, Piece, is_mention
+
+from mipmap_plugin import cli, wrap_model
+from mipmap_plugin.formats.splat_transform import find_tool
+from mipmap_plugin.recipes import DEFAULT_OUT
+
+
+def unresolved(code: str) -> list[str]:
+    """Names that nothing in a block defines, and what it imports that is not there."""
+    tree = ast.parse(code)
+    names = [node for node in ast.walk(tree) if isinstance(node, ast.Name)]
+    known, absent = {*dir(builtins), *(node.id for node in names if isinstance(node.ctx, ast.Store))}, []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            known |= {alias.asname or alias.name for alias in node.names}
+            absent += [alias.name for alias in node.names if not hasattr(importlib.import_module(node.module), alias.name)]
+        known |= {node.name} if isinstance(node, ast.FunctionDef) else {node.arg} if isinstance(node, ast.arg) else set()
+        if isinstance(node, ast.Import):
+            known |= {(alias.asname or alias.name).split(".")[0] for alias in node.names}
+    return absent + [node.id for node in names if isinstance(node.ctx, ast.Load) and node.id not in known]
+
+
+# A ladder of levels takes half a minute.
+LONG = [pytest.param(piece, marks=[pytest.mark.slow] if ".levels(" in piece.text else []) for piece in PYTHON]
+
+
+@pytest.mark.parametrize("piece", LONG, ids=str)
+@pytest.mark.usefixtures("few_views")
+def test_python_runs(piece, tmp_path, monkeypatch):
+    """On a scene that adapts in a moment, in place of the reader's; a time budget has room for no more steps than usual."""
+    assert unresolved(piece.text) == []
+    tiny.folder(tmp_path / "output/bicycle", tiny.cameras(6))
+    monkeypatch.setitem(DEFAULT_OUT, "steps", 20)
+    monkeypatch.setitem(DEFAULT_OUT, "most_steps", 20)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(piece.text, str(piece), "exec"), {"__name__": "block"})
+
+
+def test_a_wrong_name_is_found():
+    assert unresolved("from mipmap_plugin import wrap_model, wrap_it\nprint(wrap_model, modle)") == ["wrap_it", "modle"]
+
+
+# What runs, on the scene that comes along
+
+NOT_RUN = {
+    "view": "serves a page until Ctrl-C; tests/browser/test_live_view.py",
+    "demo": "run by .ci/run and tests/test_demo.py",
+    "--full": "several minutes; tests/hard has it",
+    "NAME": "stands for a name",
+    "phone.spz": "splat-transform may not be installed",
+    "SwinIR_x2.pth": "no network comes along",
+    "FILE": "no weights come along",
+    "results/garden": "no checkpoint of gsplat comes along",
+    "scenes.txt": "no list comes along",
+    "tcp://scheduler:8786": "no scheduler runs here",
+    "outputs/poster/splatfacto/2026-11-01_120000": "no checkpoint of splatfacto comes along",
+}
+FOLDERS = ("CHECKPOINT", "output/bicycle", "output/city", "lego_200")
+FILES = ("scene.ply", "point_cloud.ply")
+
+
+def runs(call: Piece) -> bool:
+    words = shlex.split(call.text)[1:]
+    return not is_mention(words) and not NOT_RUN.keys() & set(words)
+
+
+@pytest.fixture(scope="module")
+def demo_scene(tmp_path_factory):
+    """What the commands name, made of the embedded scene: checkpoints, cameras, and photographs, which the base itself shows."""
+    home, here = Path(str(files("mipmap_plugin.demo"))), tmp_path_factory.mktemp("scene")
+    for name in FOLDERS:
+        ply = here / name / "point_cloud/iteration_30000/point_cloud.ply"
+        ply.parent.mkdir(parents=True)
+        shutil.copy(home / "base.ply", ply)
+        shutil.copy(home / "cameras.json", here / name)
+        (here / name / "cfg_args").write_text("Namespace(sh_degree=3, resolution=-1, white_background=True, eval=True)")
+    for name in FILES:
+        shutil.copy(home / "base.ply", here / name)
+    (here / "data/bicycle").mkdir(parents=True)
+    shutil.copy(home / "cameras.json", here / "data/bicycle")
+    for name in ("images", "lego"):
+        base = wrap_model(here / FOLDERS[0])
+        views = [view for view in base.cameras if view.split == "test"][:3]
+        tiny.write_photographs(here / name, "test", views, lambda view, base=base: base.render(view).image)
+    return here
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("call", [call for call in CALLS if runs(call)], ids=str)
+def test_commands_run(call, demo_scene, tmp_path, monkeypatch, capsys):
+    """As they are written, but for as few steps and repetitions as there can be, and with a folder for each `DIR`."""
+    if "tradeoff" in call.text:
+        pytest.importorskip("matplotlib")
+    if {"--streamed-sog", "--tiles"} & set(call.text.split()) and "levels" in call.text and find_tool() is None:
+        pytest.skip("splat-transform is not installed")
+    monkeypatch.chdir(demo_scene)
+    words = shlex.split(call.text)[1:]
+    for place, word in enumerate(words):
+        if word == "DIR":
+            words[place] = "images" if words[place - 1] == "--images" else str(tmp_path / "results")
+    for extra in (["--steps", "3"], ["--repeats", "1"]):
+        if extra[0][2:] in inspect.signature(COMMANDS[words[0]]).parameters and extra[0] not in words:
+            words += extra
+    words += ["--overwrite"] if "overwrite" in inspect.signature(COMMANDS[words[0]]).parameters else []
+    assert cli.main(words) == 0, capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("piece", PYTHON, ids=str)
+def test_python_runs_on_the_embedded_scene(piece, demo_scene, tmp_path, monkeypatch):
+    os.makedirs(tmp_path / "output")
+    shutil.copytree(demo_scene / "output/bicycle", tmp_path / "output/bicycle")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(piece.text, str(piece), "exec"), {"__name__": "block"})
