@@ -14,7 +14,6 @@ from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
 from mipmap_plugin.formats.atomic import new_file
 from mipmap_plugin.models import API_VERSION, CERTAIN, Family, Match, TrainedScale, Traits
-from mipmap_plugin.models.conformance import ModelSuite
 from mipmap_plugin.models.contract import lacking
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.splatting.rotations import rotations
@@ -260,64 +259,3 @@ def test_what_a_backend_returns_wrong_is_told_by_its_name(members, said):
     register_backend("odd", type("Odd", (ReferenceBackend,), {"name": "odd", **members}))
     with pytest.raises(PluginError, match=f"backend 'odd':? {said}"):
         (base := wrap_model(tiny.model(), cameras=tiny.cameras(2), backend="odd")).render(base.cameras[0])
-
-
-class Faint(Theirs):
-    """It says that backends may activate its parameters, and does so otherwise."""
-
-    def gaussians(self, camera=None):
-        splats = VanillaModel.gaussians(self, camera)
-        return replace(splats, opacities=splats.opacities / 2)
-
-    def __init__(self, *arguments):
-        super().__init__(*arguments)
-        self.traits = replace(self.traits, plain=True)
-
-
-class Full(Theirs):
-    """It says that rows can be left out, and keeps them."""
-
-    def __init__(self, *arguments):
-        super().__init__(*arguments)
-        self.traits = replace(self.traits, thins=True)
-
-    def thin(self, keep):
-        pass
-
-
-class Forgetful(Theirs):
-    def reshape(self, form, views=()):
-        VanillaModel.reshape(self, lambda gaussians: (2 * form(gaussians)[0], form(gaussians)[1]), views)
-
-
-@pytest.mark.parametrize(
-    ("kind", "test"),
-    [
-        (Faint, "test_keeps_what_its_traits_promise"), (Full, "test_rows_can_be_left_out"),
-        (Forgetful, "test_shapes_that_stay_keep_the_picture"),
-    ],
-)  # fmt: skip
-def test_the_suite_sees_models_that_break_a_promise(kind, test):
-    with pytest.raises(AssertionError):
-        getattr(ModelSuite(), test)(wrap_model(kind(tiny.model().parameters()), cameras=tiny.cameras(2)))
-
-
-def test_the_suite_rebuilds_splats_of_covariances_as_adaptation_does():
-    """It hands over quaternions and scales alone."""
-
-    class Wanting(Ellipsoids):
-        def rebuild(self, form):
-            super().rebuild(lambda gaussians: replace(form(gaussians), covariances=form(gaussians).covariances.clone()))
-
-    suite, raw, views = ModelSuite(), tiny.model().parameters(), tiny.cameras(2)
-    suite.test_keeps_what_its_traits_promise(wrap_model(Ellipsoids(raw), cameras=views))
-    with pytest.raises(AttributeError, match="'clone'"):
-        suite.test_keeps_what_its_traits_promise(wrap_model(Wanting(raw), cameras=views))
-
-
-def test_the_suite_wants_a_ply_for_viewers(tmp_path):
-    with pytest.raises(PluginError, match="save"):
-        ModelSuite().test_writes_a_ply_for_viewers(wrapped(save=save_as_text), tmp_path)
-    moving = wrapped(save=save_as_text)
-    moving.model.traits = Traits(moves=True)
-    ModelSuite().test_writes_a_ply_for_viewers(moving, tmp_path)  # as no viewer draws it

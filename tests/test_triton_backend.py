@@ -1,4 +1,4 @@
-"""The Triton backend without a GPU: its kernels compile, and it reports what is missing. Their results: `test_triton_interpreted.py`."""
+"""The Triton backend without a GPU: its kernels compile, and it reports what is missing. Their results: `test_triton_interpreted*.py`."""
 
 from __future__ import annotations
 

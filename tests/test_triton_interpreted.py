@@ -2,37 +2,25 @@
 
 from __future__ import annotations
 
-import importlib.util
-import os
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import torch
 from oracle import brute_force
 from samples import camera, gaussians
+from triton_drawing import MARKS, WIDE, assert_equal, deterministic, draw, reference_result, triton_result
 
-from mipmap_plugin.adaptation.renderers import unrounded
-from mipmap_plugin.backends.base import AdamStep, Needs
+from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.conformance import CASES, check_case
-from mipmap_plugin.backends.conformance.cases import HardCase, covariances
-from mipmap_plugin.backends.conformance.checks import check_steps, check_views
+from mipmap_plugin.backends.conformance.cases import covariances
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.backends.triton import TritonBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import USUAL, RenderSettings
 from mipmap_plugin.splatting.harmonics import C0
-from mipmap_plugin.splatting.viewers import find_viewer
 
-MISSING = importlib.util.find_spec("triton") is None
-pytestmark = [
-    pytest.mark.interpreter,
-    pytest.mark.skipif(MISSING or os.environ.get("TRITON_INTERPRET") != "1", reason="triton is not installed, or TRITON_INTERPRET is not 1"),
-    pytest.mark.filterwarnings("ignore::RuntimeWarning"),  # numpy's, about infinities, on which a GPU does not warn
-]
-
-# Two by three tiles, the last ones cropped; off center, fx != fy.
-WIDE = camera(40, 24, 30.0, 26.0, cx=18.3, cy=13.9)
+pytestmark = MARKS
 
 # One case of each kind, which has broken a rasterizer here or elsewhere.
 HARD = [
@@ -43,35 +31,6 @@ HARD = [
     "spark-1", "playcanvas-1", "gaussian-splats-3d-1", "viser-1", "scale-1e4-playcanvas", "needle-1e12-spark",
     "rule-half-axis-of-the-whole", "rule-faint-and-transparent", "rule-rounded-picture", "rule-linear-light",
 ]  # fmt: skip
-
-# Of two sizes and two degrees of SH, in two orders of buckets, and with most of the rules of viewers.
-OF_VIEWERS = [
-    (view, unrounded(find_viewer(name).effects(Effects(1))))
-    for view, name in ((WIDE, "playcanvas"), (camera(16, 24), "gaussian-splats-3d"))
-]
-
-
-def draw(backend, g: Gaussians, view, effects: Effects):
-    """Image, alpha, and the gradients of a fixed weighted sum of all pixels by the name of the tensor."""
-    tensors = {f.name: getattr(g, f.name) for f in fields(g)}
-    g = Gaussians(**{name: t if t is None else t.detach().clone().requires_grad_() for name, t in tensors.items()})
-    rendered = backend(g, view, effects)
-    image, alpha = (rendered.image, rendered.alpha) if hasattr(rendered, "image") else rendered
-    weights = torch.randn(*alpha.shape, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64).to(image)
-    ((image * weights[..., :3]).sum() + (alpha * weights[..., 3]).sum()).backward()
-    grads = {f.name: getattr(g, f.name).grad for f in fields(g) if getattr(g, f.name) is not None}
-    return image.detach(), alpha.detach(), {name: grad for name, grad in grads.items() if grad is not None}
-
-
-def triton_result(g: Gaussians, view=WIDE, effects: Effects = Effects(1)):  # noqa: B008
-    return draw(TritonBackend().render, g.to(dtype=torch.float32), view, effects)
-
-
-def assert_equal(actual, expected, relative=2e-5):
-    for what, right in zip(actual[:2], expected[:2], strict=True):
-        torch.testing.assert_close(what.double(), right, atol=5e-6, rtol=0)
-    for name, grad in actual[2].items():
-        assert (grad.double() - expected[2][name]).norm() <= relative * expected[2][name].norm(), name
 
 
 @pytest.mark.parametrize("tile", [4, 8])
@@ -91,7 +50,7 @@ def test_equals_a_sum_over_every_pixel(screen_filter, eps2d, tile, monkeypatch):
 @pytest.mark.parametrize("degree", [0, 2, 3, 4])
 def test_every_harmonic_has_its_gradient(degree):
     g, view, effects = gaussians(12, degree, dtype=torch.float32), camera(16, 16), Effects(degree)
-    assert_equal(triton_result(g, view, effects), draw(ReferenceBackend().render, g.to(dtype=torch.float64), view, effects))
+    assert_equal(triton_result(g, view, effects), reference_result(g, view, effects))
 
 
 def test_a_near_plane_of_0_divides_by_nothing():
@@ -99,7 +58,7 @@ def test_a_near_plane_of_0_divides_by_nothing():
     g.means[0] = camera(16, 16).center.float()
     g.means[1, 2] = -5.0
     image, alpha, grads = triton_result(g, camera(16, 16), effects)
-    seen = draw(ReferenceBackend().render, g[torch.arange(12) > 1].to(dtype=torch.float64), camera(16, 16), effects)
+    seen = reference_result(g[torch.arange(12) > 1], camera(16, 16), effects)
     assert_equal((image, alpha, {name: grad[2:] for name, grad in grads.items()}), seen)
     assert not any(grad[:2].any() for grad in grads.values())
 
@@ -111,7 +70,7 @@ def test_a_needle_along_y_is_drawn_and_has_gradients_down_to_the_thinnest(width,
     shape = torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.tensor([[width, 1.0, width]])
     needle = Gaussians(torch.tensor([[0.3125, 0.3125, 10.0]]), *shape, torch.tensor([0.9]), torch.ones(1, 1, 3))
     image, alpha, grads = triton_result(needle, view, no_dilation)
-    right = draw(ReferenceBackend().render, needle.to(dtype=torch.float64), view, no_dilation)
+    right = reference_result(needle, view, no_dilation)
     assert_equal((image, alpha, grads if drawn else {}), right)
     assert (alpha.max() > 0.89) == drawn and all(grad.isfinite().all() and (grad.any() or not drawn) for grad in grads.values())
 
@@ -127,26 +86,22 @@ def test_covariances_need_not_be_symmetric_to_have_their_gradient():
     g = replace(g, covariances=tilted)
     result = triton_result(g, camera(16, 16))
     assert set(result[2]) == {"means", "opacities", "sh", "covariances"}
-    assert_equal(result, draw(ReferenceBackend().render, g.to(dtype=torch.float64), camera(16, 16), Effects(1)))
+    assert_equal(result, reference_result(g, camera(16, 16), Effects(1)))
 
 
 def test_pixels_stop_where_they_should():
     g = gaussians(150, dtype=torch.float32)
     g = replace(g, opacities=0.9 + 0.1 * g.opacities, scales=3 * g.scales)
-    right = draw(ReferenceBackend().render, g.to(dtype=torch.float64), camera(16, 16), Effects(1))
+    right = reference_result(g, camera(16, 16), Effects(1))
     assert (right[1] > 0.999).double().mean() > 0.5
     assert_equal(triton_result(g, camera(16, 16)), right, 1e-4)
 
 
 def test_sums_in_one_order_are_the_same_sums():
-    """In this mode torch also fills new memory with NaN, so reading uninitialized memory would be noticed."""
     g, view = gaussians(12), camera(24, 20)
     right = triton_result(g, view)
-    try:
-        torch.use_deterministic_algorithms(True)
+    with deterministic(True):
         first, again = triton_result(g, view), triton_result(g, view)
-    finally:
-        torch.use_deterministic_algorithms(False)
     assert torch.equal(first[0], right[0]) and torch.equal(first[1], right[1])
     for name, grad in first[2].items():
         assert torch.equal(grad, again[2][name])
@@ -182,43 +137,6 @@ def test_a_tile_lists_its_visible_splats_front_to_back_and_few_others(monkeypatc
     assert listed.sum() - needed.sum() < 0.2 * (boxed - needed.sum())  # far fewer than by boxes
 
 
-ROUNDED = replace(OF_VIEWERS[1][1], settings=replace(OF_VIEWERS[1][1].settings, picture_step=1 / 255))
-
-
-@pytest.mark.parametrize("in_order", [False, True])
-@pytest.mark.parametrize(
-    "shots",
-    [[(camera(12, 10), Effects(1)), (camera(8, 9), Effects(1, "antialiased"))], [(camera(12, 10), OF_VIEWERS[0][1]), (camera(8, 9), ROUNDED)]],
-    ids=["usual", "viewers"],
-)
-def test_where_lists_take_too_much_memory_strips_are_drawn_one_after_the_other(shots, in_order, monkeypatch):
-    from mipmap_plugin.backends.triton_kernels import lists
-
-    g, strips, listed, made = gaussians(5, dtype=torch.float32), [], [], lists.Lists._strip
-    g = replace(g, scales=4 * g.scales)  # most are as wide as the picture
-
-    def together(splats, _view, _effects):
-        drawn = TritonBackend().render_views(splats, shots)
-        return torch.cat([each.image.flatten(0, 1) for each in drawn])[None], torch.cat([each.alpha.flatten() for each in drawn])[None]
-
-    def strip(self, *args):
-        part = made(self, *args)
-        strips.append(part.pixels)
-        listed.append(len(part.listed))
-        return part
-
-    monkeypatch.setattr(torch, "are_deterministic_algorithms_enabled", lambda: in_order)
-    whole, weights = draw(together, g, None, None), TritonBackend().weigh_views(g, shots)
-    monkeypatch.setattr(lists, "most_pairs", lambda device: 12)
-    monkeypatch.setattr(lists.Lists, "_strip", strip)
-    in_strips, weights_in_strips = draw(together, g, None, None), TritonBackend().weigh_views(g, shots)
-    assert len({(view.start, view.stop) for view in strips}) > 3 and max(listed) <= 12
-    assert torch.equal(in_strips[0], whole[0]) and torch.equal(in_strips[1], whole[1])
-    for name, gradient in in_strips[2].items():
-        torch.testing.assert_close(gradient, whole[2][name], atol=2e-6 * float(gradient.abs().max()), rtol=1e-4)
-    torch.testing.assert_close(weights_in_strips, weights, atol=1e-5, rtol=1e-5)
-
-
 def test_rows_of_tiles_are_grouped_up_to_so_many_pairs():
     from mipmap_plugin.backends.triton_kernels import lists
 
@@ -240,57 +158,6 @@ def test_under_the_interpreter_it_serves_the_cpu_and_is_never_chosen_by_auto():
     assert TritonBackend().lacking(needs) == [] and TritonBackend().speed < 0
 
 
-@pytest.mark.parametrize("check", [check_views, check_steps])
-@pytest.mark.parametrize("case", ["sh-degree-3", "sh-bands-left-out"])
-def test_views_in_one_call_and_steps_are_right(check, case):
-    outcome = check(TritonBackend(), CASES[case])
-    assert outcome.passed, outcome.message
-
-
-@pytest.mark.parametrize("shots", [[(WIDE, Effects(1)), (camera(16, 24), Effects(1, "antialiased"))], OF_VIEWERS], ids=["usual", "viewers"])
-def test_views_of_a_step_are_summed_in_any_grouping(shots):
-    """Views of two sizes, drawn in one call and one by one."""
-    g = gaussians(20, dtype=torch.float32)
-    moments = []
-    for groups in ([shots], [shots[:1], shots[1:]]):
-        raw = {"means": g.means.clone(), "quats": 2 * g.quats, "scales": g.scales.log(), "opacities": g.opacities.logit(), "sh": g.sh.clone()}
-        first, second = ({name: torch.zeros_like(tensor) for name, tensor in raw.items()} for _ in range(2))
-        stepper = TritonBackend().stepper(raw)
-        for number, group in enumerate(groups):
-            stepper.differentiate_all([2 * rendered.image for rendered in stepper.render_all(group, number)], number=number)
-        rates = dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 1e-3)
-        stepper.step(AdamStep(raw, first, second, rates, betas=(0.9, 0.999), correction=1.0, eps=1e-8, nesterov=True))
-        moments.append((raw, first))
-    for together, alone in zip(*moments, strict=True):
-        for name, tensor in together.items():
-            torch.testing.assert_close(tensor, alone[name], atol=1e-6, rtol=1e-4)
-
-
-def test_views_of_several_viewers_in_one_call_equal_the_reference():
-    """Settings, and degrees of SH, are those of each view; one is rounded, the other not."""
-    g = gaussians(20, dtype=torch.float32)
-    shots = [OF_VIEWERS[0], (OF_VIEWERS[1][0], replace(OF_VIEWERS[1][1], settings=replace(OF_VIEWERS[1][1].settings, picture_step=1 / 255)))]
-
-    def both(render):
-        def images(splats, _view, _effects):
-            drawn = render(splats)
-            return torch.cat([each.image.flatten(0, 1) for each in drawn])[None], torch.cat([each.alpha.flatten() for each in drawn])[None]
-
-        return images
-
-    right = draw(both(lambda splats: [ReferenceBackend().render(splats, *shot) for shot in shots]), g.to(dtype=torch.float64), None, None)
-    assert_equal(draw(both(lambda splats: TritonBackend().render_views(splats, shots)), g, None, None), right, 1e-4)
-
-
-def test_steps_follow_the_gradients_in_a_viewer():
-    def case():
-        view, effects = OF_VIEWERS[0]
-        return HardCase(gaussians(20), view, effects)
-
-    outcome = check_steps(TritonBackend(), case)
-    assert outcome.passed, outcome.message
-
-
 def test_culled_splats_are_listed_for_their_gradient_only():
     from mipmap_plugin.backends.triton_kernels import drawing
 
@@ -310,38 +177,6 @@ def test_blend_weights_are_the_gradient_of_a_white_color(settings):
     image = ReferenceBackend().render(white, WIDE, effects).image
     [gradient] = torch.autograd.grad(image[..., 0].sum(), colors)
     for in_order in (False, True):
-        try:
-            torch.use_deterministic_algorithms(in_order)
+        with deterministic(in_order):
             weights = TritonBackend().blend_weights(g, WIDE, effects)
-        finally:
-            torch.use_deterministic_algorithms(False)
         torch.testing.assert_close(weights, gradient[:, 0, 0] / C0, atol=1e-5, rtol=1e-4)
-
-
-def test_a_step_moves_all_numbers_of_splats_without_bands():
-    """Their quaternions have more numbers than their colors."""
-    from mipmap_plugin.backends.triton_kernels import NUMBERS_MOVED
-
-    g, view = gaussians(NUMBERS_MOVED, 0, dtype=torch.float32), camera(4, 4)
-    raw = {name: getattr(g, name).clone() for name in ("means", "quats", "scales", "opacities", "sh")}
-    before = {name: tensor.clone() for name, tensor in raw.items()}
-    first, second = ({name: torch.ones_like(tensor) for name, tensor in raw.items()} for _ in range(2))
-    stepper = TritonBackend().stepper(raw)
-    stepper.differentiate(0, stepper.render(0, view, Effects(0)).image)
-    rates = dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 1.0)
-    stepper.step(AdamStep(raw, first, second, rates, betas=(0.9, 0.9), correction=1.0, eps=1e-8))
-    assert all((raw[name] != before[name]).all() for name in raw)
-
-
-@pytest.mark.parametrize("size", [0.0, 1e-38, 1e-29, 1e-22, 1e-15])
-def test_steps_of_very_short_quaternions_are_finite(size):
-    """The squares of their gradients would overflow float32."""
-    g, view = gaussians(4, 0, dtype=torch.float32), camera(4, 4)
-    raw = {name: getattr(g, name).clone() for name in ("means", "quats", "scales", "opacities", "sh")}
-    raw["quats"] *= size
-    first, second = ({name: torch.zeros_like(tensor) for name, tensor in raw.items()} for _ in range(2))
-    stepper, rates = TritonBackend().stepper(raw), dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 1e-3)
-    for _ in range(3):
-        stepper.differentiate(0, stepper.render(0, view, Effects(0)).image)
-        stepper.step(AdamStep(raw, first, second, rates, betas=(0.9, 0.9), correction=1.0, eps=1e-8))
-    assert all(tensor.isfinite().all() for tensor in raw.values())
