@@ -202,7 +202,7 @@ def _camera(values: Mapping[str, Any], size: tuple[int, int], name: str, split: 
     if fx is None:
         raise SceneError(f"{where}: has neither 'fl_x' nor 'camera_angle_x'; add one to the file")
     fy = _focal(values, "y", height, where) or fx
-    cx, cy = (principal_point(values.get(key), side, f"{where}, {key}") for key, side in (("cx", width), ("cy", height)))
+    cx, cy = principal_point(values, size, where)
     time = numbers(values["time"], (), f"{where}, time").item() if values.get("time") is not None else None
     return Camera(width, height, fx, fy, cx, cy, _viewmat(values, where), name, split, time)
 

@@ -178,7 +178,7 @@ def test_without_a_test_file_val_is_the_test_split(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"cx": 0.5}, r"frame 0 \(r_0\), cx: is 0.5, but must be in pixels"),
+        ({"cx": 0.5}, r"frame 0 \(r_0\): has cx 0.5, but must have pixels"),
         ({"k1": "x"}, r"frame 0 \(r_0\), k1: is not made of numbers"),
         ({"camera_model": "EQUIRECTANGULAR"}, r"has a lens that is not perspective \(EQUIRECTANGULAR\)"),
         ({"camera_model": "EQUIRECTANGULAR", "fl_x": None}, r"has a lens that is not perspective \(EQUIRECTANGULAR\)"),

@@ -78,8 +78,9 @@ def at_density_of(cameras: Sequence[Camera], base: Sequence[Camera]) -> list[Cam
     def at_density(camera: Camera) -> Camera:
         own = named.get(Path(camera.name).stem, [])
         view = similar_of_name.get(Path(camera.name).stem, similar)(camera)
-        ratio = view.fx / camera.fx
-        resized = camera.resized(max(1, round(camera.width * ratio)), max(1, round(camera.height * ratio)))
+        # Each side by itself: where the base's view is of the same field, the size is that of its training, however that was rounded.
+        sides = (camera.width * view.fx / camera.fx, camera.height * view.fy / camera.fy)
+        resized = camera.resized(*(max(1, round(side)) for side in sides))
         if camera.index is None and len(own) == 1 and view.split == camera.split:
             resized = replace(resized, index=view.index)
         return replace(resized, cx=resized.width / 2, cy=resized.height / 2) if _is_centered(view) else resized
