@@ -16,7 +16,7 @@ from mipmap_plugin.camera import OPENGL_TO_OPENCV, Camera
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import ROTATION_TOLERANCE, numbers, pixels, positive, present, read_json, rotation
-from mipmap_plugin.scenes.base import ABSENT, MASKED, Scene, refuse_other_shape
+from mipmap_plugin.scenes.base import ABSENT, MASKED, Scene, note_on_shapes, other_shape
 from mipmap_plugin.scenes.cameras_json import numbers_views, principal_point, trained_size
 from mipmap_plugin.scenes.intrinsics import DISTORTION, overruled, values_of
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, can_undistort, note
@@ -130,6 +130,7 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
         raise SceneError(f"{file}: {lacks}; give a NeRF-Synthetic, instant-ngp or nerfstudio transforms file")
     views: list[View] = []
     places: list[PurePosixPath] = []
+    shapes: list[str] = []
     absent, passed_over, trained = 0, 0, {_place(str(name)) for name in names} if isinstance(names := data.get("train_filenames"), list) else None
     tests = tests if isinstance(tests := data.get("test_frames"), list) else []  # of ScanNet++
     for index, frame in enumerate([*frames, *tests]):
@@ -148,7 +149,7 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
             if trained is not None or index >= len(frames):
                 split = "train" if trained is not None and _place(listed) in trained else "test"
             if stated and image:
-                refuse_other_shape(stated, image, f"{where} ({name})")
+                shapes.append(other_shape(stated, image, f"{where} ({name})"))
             model = _lens_model(values, f"{where} ({name})")
             camera = _camera(values, stated or actual, name, split, f"{where} ({name})").resized(*actual)
             lens = _lens(values, model, camera, f"{where} ({name})")
@@ -156,6 +157,7 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
             places.append(_place(listed))
     unsized = absent - sum(image is None for _, image, _ in views)
     notes = [f"{file.name}: {_counted(absent)} {ABSENT}{_left_out(unsized)}"] if absent else []
+    notes += note_on_shapes(shapes)
     if passed_over:
         notes.append(f"{file.name}: the intrinsics of {passed_over} of its frames are passed over for those of the file, as in nerfstudio")
     if masked := sum(bool(frame.get("mask_path")) for frame in frames):
