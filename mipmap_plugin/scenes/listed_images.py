@@ -1,0 +1,56 @@
+"""Where the images are that a transforms file lists."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+from mipmap_plugin.formats.images import is_file
+
+IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+
+# ScanNet++ has its transforms files in this folder, and the images in one beside it: as downloaded, or as its toolkit makes them.
+BESIDE = "nerfstudio"
+SCANNETPP = {
+    "transforms.json": ("resized_images", "rgb", "images"),
+    "transforms_undistorted.json": ("resized_undistorted_images", "undistorted_images"),
+}
+
+# Folder of the images in most captures, and of their smaller copies.
+WHOLE, COPIES = "images", re.compile(r"images_(\d{1,9})")
+
+
+def listed_images(file: Path, listed: Sequence[str]) -> tuple[list[Path | None], str]:
+    """The image files that a transforms file lists, each None if it is missing, and the name of the folder of smaller copies, if these are taken.
+
+    They are beside the file or where ScanNet++ has them. If none of them is there, as in captures of DL3DV that were downloaded small, the largest
+    copies (images_2, images_4, ...) are taken.
+    """
+    beside = SCANNETPP.get(file.name, ()) if file.absolute().parent.name == BESIDE else ()
+    for folder in (file.parent, *(file.absolute().parent.with_name(name) for name in beside)):
+        found = [_image(folder, each) for each in listed]
+        if any(found):
+            return found, ""
+    for _, copies in sorted((int(match[1]), each) for each in file.parent.glob("images_*") if (match := COPIES.fullmatch(each.name))):
+        found = [_image(copies, str(PurePosixPath(*place_of(each).parts[1:]))) if place_of(each).parts[:1] == (WHOLE,) else None for each in listed]
+        if any(found):
+            return found, copies.name
+    return [None] * len(listed), ""
+
+
+def place_of(listed: str) -> PurePosixPath:
+    """A listed name of a file, by which `./a` is the same as `a`."""
+    return PurePosixPath(listed.replace("\\", "/"))
+
+
+def stem_of(listed: str) -> str:
+    """The name of a view whose image is absent: that of the image, without the suffix if it has one."""
+    name = place_of(listed).name
+    return next((name.removesuffix(suffix) for suffix in IMAGE_SUFFIXES[1:] if name.endswith(suffix)), name)
+
+
+def _image(folder: Path, listed: str) -> Path | None:
+    """The image file of a `file_path`, which may lack its suffix; None if it is missing."""
+    stem = listed.replace("\\", "/")
+    return next((folder / f"{stem}{suffix}" for suffix in IMAGE_SUFFIXES if is_file(folder / f"{stem}{suffix}")), None)
