@@ -325,3 +325,10 @@ def test_photographs_that_were_cropped_a_little_are_told_of_and_rounded_copies_a
     write_photographs(tmp_path / "images", names(2), size=size)
     told_of = f"the cameras of 2 photographs are stretched to their shape, as in 3DGS (000.png has {size[0]} x {size[1]} px, its camera 64 x 48 px)"
     assert [note.partition(";")[0] for note in load_scene(tmp_path).warnings()] == [told_of] * told
+
+
+def test_photographs_may_have_another_suffix_than_colmap_saw(tmp_path):
+    """.JPG and .jpg are the same to Windows, and some are converted."""
+    write_text_model(tmp_path / "sparse/0", ["a.JPG", "sub/b.jpg", "c.png"])
+    write_photographs(tmp_path / "images", ["a.jpg", "sub/b.png", "c.png"])
+    assert [file.name for file in load_scene(tmp_path).images.values()] == ["a.jpg", "c.png", "b.png"]

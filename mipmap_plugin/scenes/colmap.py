@@ -20,6 +20,7 @@ from mipmap_plugin.scenes.base import ABSENT, SPLIT, Scene, note_on_shapes, othe
 from mipmap_plugin.scenes.cameras_json import TEST_EVERY, numbers_views, photographs_folder, tests_by_lod, trained_size
 from mipmap_plugin.scenes.colmap_sizes import refuse_truncated
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, note
+from mipmap_plugin.scenes.listed_images import image_file
 
 if TYPE_CHECKING:
     import pycolmap
@@ -68,7 +69,7 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     tests = range(0, len(images), TEST_EVERY) if by_lod is None else by_lod
     for index, image in enumerate(images):
         camera = _camera(model, image, "test" if index in tests else "train", centered=bool(cfg))
-        photograph, lens = folder / image.name, _lens(model.cameras[image.camera_id], unbent)
+        photograph, lens = image_file(folder, image.name) or folder / image.name, _lens(model.cameras[image.camera_id], unbent)
         exists, options = is_file(photograph), cfg
         if exists:
             shapes.append(other_shape((camera.width, camera.height), photograph, str(photograph)))

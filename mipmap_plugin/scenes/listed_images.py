@@ -29,14 +29,22 @@ def listed_images(file: Path, listed: Sequence[str]) -> tuple[list[Path | None],
     """
     beside = SCANNETPP.get(file.name, ()) if file.absolute().parent.name == BESIDE else ()
     for folder in (file.parent, *(file.absolute().parent.with_name(name) for name in beside)):
-        found = [_image(folder, each) for each in listed]
+        found = [image_file(folder, each) for each in listed]
         if any(found):
             return found, ""
     for _, copies in sorted((int(match[1]), each) for each in file.parent.glob("images_*") if (match := COPIES.fullmatch(each.name))):
-        found = [_image(copies, str(PurePosixPath(*place_of(each).parts[1:]))) if place_of(each).parts[:1] == (WHOLE,) else None for each in listed]
+        places = [place_of(each) for each in listed]
+        found = [image_file(copies, str(place.relative_to(WHOLE))) if place.is_relative_to(WHOLE) else None for place in places]
         if any(found):
             return found, copies.name
     return [None] * len(listed), ""
+
+
+def image_file(folder: Path, listed: str) -> Path | None:
+    """The image file of a listed name, which may lack its suffix, or have another since (.JPG, .jpg); None if it is missing."""
+    name = listed.replace("\\", "/")
+    names = (f"{stem}{suffix}" for stem in dict.fromkeys((name, _without_suffix(name))) for suffix in IMAGE_SUFFIXES)
+    return next((folder / each for each in names if is_file(folder / each)), None)
 
 
 def place_of(listed: str) -> PurePosixPath:
@@ -46,11 +54,8 @@ def place_of(listed: str) -> PurePosixPath:
 
 def stem_of(listed: str) -> str:
     """The name of a view whose image is absent: that of the image, without the suffix if it has one."""
-    name = place_of(listed).name
+    return _without_suffix(place_of(listed).name)
+
+
+def _without_suffix(name: str) -> str:
     return next((name.removesuffix(suffix) for suffix in IMAGE_SUFFIXES[1:] if name.endswith(suffix)), name)
-
-
-def _image(folder: Path, listed: str) -> Path | None:
-    """The image file of a `file_path`, which may lack its suffix; None if it is missing."""
-    stem = listed.replace("\\", "/")
-    return next((folder / f"{stem}{suffix}" for suffix in IMAGE_SUFFIXES if is_file(folder / f"{stem}{suffix}")), None)

@@ -45,8 +45,9 @@ class Photographs:
         self.cameras = list(self._originals)
         for view, original in self._originals.items():
             if (size := scene.image_size(original))[0] < (1 - SHAPE_TOLERANCE) * view.width:
+                remedy = f"give larger photographs, or leave them out, or, if it was trained on these, add --cameras {scene.source}"
                 small = f"{scene.images[original]} has {size[0]} x {size[1]} px, but the base was trained at {view.width} x {view.height} px"
-                raise SettingsError(f"{small}: made larger, it shows less than the base; give larger photographs, or leave them out")
+                raise SettingsError(f"{small}: made larger, it shows less than the base; {remedy}")
 
     def note(self, views: Sequence[Camera]) -> str:
         """How many of the views have a photograph. Raises SettingsError if none has."""
