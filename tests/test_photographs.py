@@ -53,6 +53,9 @@ def test_images_of_several_sizes_are_brought_to_the_density_of_their_own_views()
     by_name = [replace(base[0], name="a"), replace(base[0].resized(400, 300), name="b")]
     photographs = [replace(wide, name=name) for name in ("images/b.jpg", "a.png", "c")]
     assert [camera.width for camera in at_density_of(photographs, by_name)] == [400, 1600, 1600]
+    for alike in ("frame.1", "frame.2.png"), ("left/a", "right/a"):  # which differ behind a dot, or by their folder
+        views, photographs = ([replace(each, name=name) for each, name in zip(those, alike, strict=True)] for those in (by_name, (wide, wide)))
+        assert [camera.width for camera in at_density_of(photographs, views)] == [1600, 400]
 
 
 def test_a_photograph_has_the_size_of_its_view_in_the_training():

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from statistics import fmean
 
 import torch
 
+from mipmap_plugin.adaptation.target.photographs import names_of
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.evaluation.measure import resized_base, views_seen
@@ -52,16 +52,16 @@ def of_another_size(model: Wrapped, scene: Scene) -> str:
 
     A cameras.json states the size that COLMAP saw, which the photographs of Tanks and Temples in 3DGS's own download have not: they are half of it.
     """
-    cfg, sizes = read_options(model.model.folder)[0], {Path(view.name).stem: (view.width, view.height) for view in model.cameras}
-    views = (view for view, file in scene.images.items() if file.parent.name == photographs_folder(cfg) and file not in scene.lenses)
-    view = next((view for view in views if Path(view.name).stem in sizes), None)
+    cfg = read_options(model.model.folder)[0]
+    whole = (view for view, file in scene.images.items() if file.parent.name == photographs_folder(cfg) and file not in scene.lenses)
+    view = next(whole, None)
     if not cfg or view is None:
         return ""
-    own, there = scene.image_size(view), sizes[Path(view.name).stem]
-    trained = trained_size(*own, {**cfg, "images": "", "ds": 1})
-    if max(abs(one - other) for one, other in zip(trained, there, strict=True)) <= ROUNDING:
+    own, names = scene.image_size(view), names_of(view)
+    trained, there = trained_size(*own, {**cfg, "images": "", "ds": 1}), [base for base in model.cameras if names_of(base)[0] in names]
+    if not there or any(max(abs(base.width - trained[0]), abs(base.height - trained[1])) <= ROUNDING for base in there):
         return ""
-    said, found, expected = (f"{width} x {height} px" for width, height in (there, own, trained))
+    said, found, expected = (f"{width} x {height} px" for width, height in ((there[0].width, there[0].height), own, trained))
     doubt = f"the base's cameras are of {said}, but a training on the photographs (of {found}) has pictures of {expected}"
     return f"{doubt}: if these are what it was trained on, x1 is another scale than is taken here; add --cameras {scene.source}"
 

@@ -8,7 +8,8 @@ from pathlib import Path, PurePosixPath
 
 from mipmap_plugin.formats.images import is_file
 
-IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+IMAGE_SUFFIXES = ("", *SUFFIXES, *(suffix.upper() for suffix in SUFFIXES))
 
 # ScanNet++ has its transforms files in this folder, and the images in one beside it: as downloaded, or as its toolkit makes them.
 BESIDE = "nerfstudio"
@@ -43,7 +44,7 @@ def listed_images(file: Path, listed: Sequence[str]) -> tuple[list[Path | None],
 def image_file(folder: Path, listed: str) -> Path | None:
     """The image file of a listed name, which may lack its suffix, or have another since (.JPG, .jpg); None if it is missing."""
     name = listed.replace("\\", "/")
-    names = (f"{stem}{suffix}" for stem in dict.fromkeys((name, _without_suffix(name))) for suffix in IMAGE_SUFFIXES)
+    names = (f"{stem}{suffix}" for stem in dict.fromkeys((name, without_suffix(name))) for suffix in IMAGE_SUFFIXES)
     return next((folder / each for each in names if is_file(folder / each)), None)
 
 
@@ -54,8 +55,9 @@ def place_of(listed: str) -> PurePosixPath:
 
 def stem_of(listed: str) -> str:
     """The name of a view whose image is absent: that of the image, without the suffix if it has one."""
-    return _without_suffix(place_of(listed).name)
+    return without_suffix(place_of(listed).name)
 
 
-def _without_suffix(name: str) -> str:
+def without_suffix(name: str) -> str:
+    """A name without the suffix of an image: what is behind the last dot of `frame.0001` is none."""
     return next((name.removesuffix(suffix) for suffix in IMAGE_SUFFIXES[1:] if name.endswith(suffix)), name)
