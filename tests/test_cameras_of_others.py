@@ -24,12 +24,21 @@ def test_a_principal_point_in_a_cameras_json_is_read(tmp_path):
     assert (halved.width, halved.cx, halved.cy) == (cropped.width // 2, 5.5, 7.75)
 
 
-@pytest.mark.parametrize("wrong", [0.5, -0.02, "left"])
-def test_a_principal_point_in_other_units_is_refused(tmp_path, wrong):
-    path = write_cameras(tmp_path / "cameras.json", [replace(tiny.cameras(1)[0], cx=11.0)])
-    path.write_text(path.read_text().replace("11.0", json.dumps(wrong)))
-    with pytest.raises(SceneError, match=r"entry 0 \(view_0\), cx: is "):
+@pytest.mark.parametrize(
+    ("cx", "cy", "said"),
+    [(0.5, 0.5, ": has cx 0.5 and cy 0.5, but must have pixels"), (-0.02, None, ": has cx -0.02, but must"), ("left", 11.0, ", cx: is not")],
+)
+def test_a_principal_point_in_other_units_is_refused(tmp_path, cx, cy, said):
+    path = write_cameras(tmp_path / "cameras.json", [replace(tiny.cameras(1)[0], cx=11.0, cy=15.0)])
+    path.write_text(path.read_text().replace("11.0", json.dumps(cx)).replace("15.0", json.dumps(cy)))
+    with pytest.raises(SceneError, match=rf"entry 0 \(view_0\){said}"):
         read_cameras(path)
+
+
+def test_a_principal_point_may_lie_at_an_edge(tmp_path):
+    """A tile of a large picture has it anywhere."""
+    path = write_cameras(tmp_path / "cameras.json", [replace(tiny.cameras(1)[0], cx=0.5, cy=17.0)])
+    assert [(camera.cx, camera.cy) for camera in read_cameras(path)] == [(0.5, 17.0)]
 
 
 def transforms(folder, **facts):

@@ -317,3 +317,28 @@ def test_a_real_capture_of_which_most_photographs_are_absent(shared_data):
     seen = scene.points @ first.viewmat[:3, :3].T + first.viewmat[:3, 3]
     across = first.fx * seen[:, 0] / seen[:, 2] + first.cx
     assert ((seen[:, 2] > 0) & (across > 0) & (across < first.width)).float().mean() > 0.5  # a capture that looks at one place
+
+
+@pytest.mark.parametrize(("folder", "taken"), [("rgb", "rgb"), ("images_4", "images"), ("absent", "images")])
+def test_photographs_of_a_folder_of_another_name_are_those_of_the_training(tmp_path, folder, taken):
+    """Option -i of 3DGS; copies are for training, and the whole photographs for judging."""
+    write_text_model(tmp_path / "sparse/0", ["a.png"])
+    for place in {taken, "images"}:
+        write_photographs(tmp_path / place, ["a.png"])
+    scene = load_photographs(tmp_path, {"images": folder, "resolution": 2, "eval": True})
+    assert [(file.parent.name, camera.size) for camera, file in scene.images.items()] == [(taken, (48, 64))]
+
+
+@pytest.mark.parametrize(("size", "told"), [((64, 46), True), ((31, 24), False), ((32, 23), False), ((62, 48), True)])
+def test_photographs_that_were_cropped_a_little_are_told_of_and_rounded_copies_are_not(tmp_path, size, told):
+    write_text_model(tmp_path / "sparse/0", names(2))
+    write_photographs(tmp_path / "images", names(2), size=size)
+    told_of = f"the cameras of 2 photographs are stretched to their shape, as in 3DGS (000.png has {size[0]} x {size[1]} px, its camera 64 x 48 px)"
+    assert [note.partition(";")[0] for note in load_scene(tmp_path).warnings()] == [told_of] * told
+
+
+def test_photographs_may_have_another_suffix_than_colmap_saw(tmp_path):
+    """.JPG and .jpg are the same to Windows, and some are converted."""
+    write_text_model(tmp_path / "sparse/0", ["a.JPG", "sub/b.jpg", "c.png"])
+    write_photographs(tmp_path / "images", ["a.jpg", "sub/b.png", "c.png"])
+    assert [file.name for file in load_scene(tmp_path).images.values()] == ["a.jpg", "c.png", "b.png"]

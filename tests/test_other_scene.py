@@ -9,10 +9,11 @@ import torch
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.cli import main
-from mipmap_plugin.evaluation.other_scene import of_another_scene
+from mipmap_plugin.evaluation.other_scene import of_another_scene, of_another_size
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.evaluation.tradeoff.truth import photographs
-from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.formats.images import write_image
+from mipmap_plugin.scenes import Scene, load_scene
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
@@ -72,3 +73,22 @@ def test_photographs_of_several_sizes_are_compared(base):
     cameras = tiny.cameras(4)
     square = [camera.window(24, 24) if number % 2 else camera for number, camera in enumerate(cameras)]
     assert not doubt(base, seen(base, square)) and {camera.size for camera in square} == {(24, 32), (24, 24)}
+
+
+@pytest.mark.parametrize(
+    ("size", "resolution", "told"),
+    [
+        ((32, 24), -1, ""),
+        ((16, 12), -1, "the base's cameras are of 32 x 24 px, but a training on the photographs (of 16 x 12 px) has pictures of 16 x 12 px"),
+        ((64, 48), 2, "the base's cameras are of 16 x 12 px, but a training on the photographs (of 64 x 48 px) has pictures of 32 x 24 px"),
+        ((64, 48), 32, ""),
+    ],
+)
+def test_photographs_of_another_size_than_the_cameras_state_are_told_of(tmp_path, size, resolution, told):
+    """As in 3DGS's download of Tanks and Temples: COLMAP, and so cameras.json, has twice the size of the photographs."""
+    folder, view = tiny.folder(tmp_path / "base"), tiny.cameras(1)[0]
+    (folder / "cfg_args").write_text(f"Namespace(images='images', resolution={resolution}, eval=False)")
+    (tmp_path / "images").mkdir()
+    image = write_image(tmp_path / "images" / f"{view.name}.png", torch.zeros(size[1], size[0], 3))
+    doubted = of_another_size(wrap_model(folder, backend="reference"), Scene((view,), {view: image}, tmp_path))
+    assert doubted.partition(":")[0] == told

@@ -19,6 +19,7 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.recipes import DEFAULT_IN, recipe
 from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.scenes.cameras_json import trained_size
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
 BLACK = (0.0, 0.0, 0.0)
@@ -52,6 +53,18 @@ def test_images_of_several_sizes_are_brought_to_the_density_of_their_own_views()
     by_name = [replace(base[0], name="a"), replace(base[0].resized(400, 300), name="b")]
     photographs = [replace(wide, name=name) for name in ("images/b.jpg", "a.png", "c")]
     assert [camera.width for camera in at_density_of(photographs, by_name)] == [400, 1600, 1600]
+    for alike in ("frame.1", "frame.2.png"), ("left/a", "right/a"):  # which differ behind a dot, or by their folder
+        views, photographs = ([replace(each, name=name) for each, name in zip(those, alike, strict=True)] for those in (by_name, (wide, wide)))
+        assert [camera.width for camera in at_density_of(photographs, views)] == [1600, 400]
+
+
+def test_a_photograph_has_the_size_of_its_view_in_the_training():
+    """3DGS truncates both sides if `-r` is a width: 301.6 px are 301 px there."""
+    photograph = Camera(1000, 754, 900, 910, 500, 377, torch.eye(4))
+    base = photograph.resized(*trained_size(1000, 754, {"resolution": 400}))
+    assert base.size == (301, 400)
+    [view] = at_density_of([photograph], [base])
+    assert view.size == base.size and (view.fx, view.fy) == pytest.approx((base.fx, base.fy))
 
 
 def test_the_principal_point_is_where_the_base_has_it():

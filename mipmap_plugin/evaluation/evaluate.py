@@ -29,7 +29,7 @@ from mipmap_plugin.evaluation.measure import (
     warm_up,
 )  # fmt: skip
 from mipmap_plugin.evaluation.metrics import psnr, ssim
-from mipmap_plugin.evaluation.other_scene import of_another_scene
+from mipmap_plugin.evaluation.other_scene import of_another_scene, of_another_size
 from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.photographs import digest_of_image
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, not_held_out, views_of_placed
@@ -162,6 +162,8 @@ def evaluator_of(
     if protocol not in (names := [*PROTOCOLS]):
         raise SettingsError(unknown("protocol", str(protocol), names))
     scene = model.place(scene)
+    if doubt := of_another_size(model, scene):
+        warnings.warn(doubt, stacklevel=2)
     views, notes = views_of_placed(model, scene), [*scene.notes, *not_held_out(model, scene)]
     return Evaluator(views, PROTOCOLS[protocol], perceptual, scene.source.name, cells=cells or Cells(), notes=notes)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.process.torch_modes import in_usual_modes
 from mipmap_plugin.scenes.base import Scene
-from mipmap_plugin.scenes.cameras_json import DEFORMABLE, read_cameras, write_cameras
+from mipmap_plugin.scenes.cameras_json import DEFORMABLE, photographs_folder, read_cameras, write_cameras
 from mipmap_plugin.scenes.colmap import UNBENT, is_colmap, read_colmap, unbent_by
 from mipmap_plugin.scenes.in_ply import cameras_in
 from mipmap_plugin.scenes.moving import is_dynerf, is_hypernerf, read_dynerf, read_hypernerf
@@ -67,13 +68,20 @@ def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
 def load_photographs(path: str | Path, cfg: dict[str, Any]) -> Scene:
     """The scene at `path` with photographs at their own size, whatever size a checkpoint with these cfg_args was trained at.
 
-    Only those options count by which Deformable 3D Gaussians reads captures of DyNeRF and HyperNeRF, and others take lenses of COLMAP for pinholes.
+    Only those options count by which Deformable 3D Gaussians reads captures of DyNeRF and HyperNeRF, and others take lenses of COLMAP for pinholes,
+    and the folder of photographs, if it is neither `images` nor one of copies.
     Raises SceneError.
     """
     path = path_of(path)
     if DEFORMABLE in cfg and (is_dynerf(path) or is_hypernerf(path)):
         return load_scene(path, {**cfg, "resolution": 1})
-    return load_scene(path, {name: cfg[name] for name in UNBENT if name in cfg} if unbent_by(cfg) and is_colmap(path) else None)
+    if not is_colmap(path):
+        return load_scene(path)
+    kept = {name: cfg[name] for name in UNBENT if name in cfg} if unbent_by(cfg) else {}
+    folder = photographs_folder(cfg)
+    if not re.fullmatch(r"images(_\d+)?", folder) and (path / folder).is_dir():
+        kept |= {"images": folder}
+    return load_scene(path, kept or None)
 
 
 def model_cameras(folder: str | Path | None, cfg: dict[str, Any] | None = None) -> list[Camera]:

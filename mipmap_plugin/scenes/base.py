@@ -26,7 +26,10 @@ MASKED = "masked"
 # The words of notes on which views are taken to be for testing.
 SPLIT = "is for testing"
 
-# How far the ratio of a photograph's sides may be from that of its camera: copies are rounded to whole pixels, some to multiples.
+# The word of notes on photographs of other proportions than their cameras'.
+STRETCHED = "stretched"
+
+# How far the ratio of a photograph's sides may be from that of its camera: some copies are rounded to multiples. Beyond whole pixels a note says so.
 SHAPE_TOLERANCE = 0.1
 
 
@@ -69,8 +72,8 @@ class Scene:
         return bool(self.images) or self.points is not None or self.applied is not None
 
     def warnings(self) -> list[str]:
-        """The notes that concern every figure: on photographs that are listed and not there, and on masked ones."""
-        return [note for note in self.notes if f" {ABSENT}" in note or f" {MASKED}" in note]
+        """The notes that concern every figure: on photographs that are listed and not there, masked, or of other proportions than their cameras."""
+        return [note for note in self.notes if any(f" {word}" in note for word in (ABSENT, MASKED, STRETCHED))]
 
     def split(self, name: str) -> list[Camera]:
         """The cameras of "train" or "test", in file order. Raises SettingsError for another name."""
@@ -146,20 +149,33 @@ def sizes_of(cameras: Sequence[Camera]) -> str:
     return f"{ends[0]} px" if len(sizes) == 1 else f"{' and ' if len(sizes) == 2 else ' to '}".join(ends) + " px"
 
 
-def refuse_other_shape(stated: tuple[int, int], photograph: Path, where: str) -> None:
-    """Raise SceneError, beginning with `where`, for a photograph that is no copy of the size that its camera states: one that was turned or cropped.
+def other_shape(stated: tuple[int, int], photograph: Path, where: str) -> str:
+    """The sizes of a photograph and its camera in words, if the ratios of their sides differ by more than copies are rounded; "" if they do not.
 
-    `stated`: (width, height), px. Resized to such a photograph, the camera would show a distorted scene.
+    `stated`: (width, height) of the camera, px. Raises SceneError, beginning with `where`, for a photograph that was turned, or cropped by much:
+    resized to such a photograph, the camera would show a distorted scene.
     """
     (wide, high), (width, height) = stated, image_size(photograph)
-    if _other_shape(stated, (width, height)):
+    if _too_far(stated, (width, height)):
         advice = "it was turned or cropped since; give the photographs that the cameras were found in, or leave them out"
-        if shown_turned(photograph) and not _other_shape(stated, (height, width)):
+        if shown_turned(photograph) and not _too_far(stated, (height, width)):
             advice = "its EXIF says to show it turned, which is not done here; save a copy whose pixels are turned (magick -auto-orient)"
         raise SceneError(f"{where}: its camera is of {wide} x {high} px, but the photograph has {width} x {height} px: {advice}")
+    rounding = 1 + high / wide if width < wide and height < high else 1.0  # px of the height; both sides of a smaller copy are rounded
+    differs = abs(height - high * width / wide) > rounding
+    return f"{photograph.name} has {width} x {height} px, its camera {wide} x {high} px" if differs else ""
 
 
-def _other_shape(stated: tuple[int, int], size: tuple[int, int]) -> bool:
-    """Whether the ratio of the sides of `size` is another than that of the `stated` one, beyond rounding."""
+def note_on_shapes(found: Sequence[str]) -> list[str]:
+    """A note on photographs that have another shape than their cameras (`other_shape`), if there are any."""
+    if not any(found):
+        return []
+    others = [each for each in found if each]
+    cropped = "if they were cropped, every figure is of a distorted scene: give the cameras of the cropped ones"
+    return [f"the cameras of {len(others)} photographs are {STRETCHED} to their shape, as in 3DGS ({others[0]}); {cropped}"]
+
+
+def _too_far(stated: tuple[int, int], size: tuple[int, int]) -> bool:
+    """Whether the ratio of the sides of `size` is far from that of the `stated` one."""
     (wide, high), (width, height) = stated, size
     return abs(math.log(wide * height / (high * width))) > SHAPE_TOLERANCE + 1 / min(width, height)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -148,12 +148,12 @@ def trained_size(width: int, height: int, cfg: dict[str, Any]) -> tuple[int, int
     """(width, height) in px after INRIA's `-i images_N` and `-r`, from the size in cameras.json.
 
     For COLMAP scenes the file states the full resolution, whatever the size of the training photographs. The folders
-    images_2, images_4 and images_8 contain photographs shrunk by that factor. Rounding is that of `loadCam`: divisors
-    round, the cap and the target width truncate. Raises SceneError for another `resolution`.
+    images_2, images_4 and images_8 contain photographs shrunk by that factor, by ImageMagick, which rounds halves up. Rounding of `-r` is that of
+    `loadCam`: divisors round halves to even numbers, the cap and the target width truncate. Raises SceneError for another `resolution`.
     """
     shrunk = re.fullmatch(r"images_(\d{1,9})", photographs_folder(cfg))
     if shrunk and int(shrunk[1]) > 0:
-        width, height = max(1, round(width / int(shrunk[1]))), max(1, round(height / int(shrunk[1])))
+        width, height = (max(1, math.floor(side / int(shrunk[1]) + 0.5)) for side in (width, height))
     resolution = cfg.get("resolution", 1)
     if not isinstance(resolution, (int, float)) or not (resolution == -1 or 0 < resolution <= MAX_SIDE):
         raise SceneError(f"cfg_args: resolution={resolution!r} is no training size; use 1, 2, 4, 8, -1 or a width in pixels")
@@ -177,15 +177,17 @@ def _camera(entry: dict[str, Any], name: str, split: Any, where: str) -> Camera:
     viewmat = viewmat_of(camera_to_world, position)
     width, height = (pixels(present(entry, key, where), f"{where}, {key}") for key in ("width", "height"))
     fx, fy = (positive(present(entry, key, where), f"{where}, {key}") for key in ("fx", "fy"))
-    cx, cy = (principal_point(entry.get(key), side, f"{where}, {key}") for key, side in (("cx", width), ("cy", height)))
+    cx, cy = principal_point(entry, (width, height), where)
     return Camera(width, height, fx, fy, cx, cy, viewmat, name, split)
 
 
-def principal_point(value: Any, side: int, where: str) -> float:
-    """px from the edge; the middle of the `side` (px) if there is no value. Raises SceneError for what seems to be in another unit."""
-    if value is None:
-        return side / 2
-    number = numbers(value, (), where).item()
-    if abs(number) <= 1 < side / 2:  # a fraction of the image, or an offset from its center
-        raise SceneError(f"{where}: is {number:g}, but must be in pixels from the edge of the image; correct it, or leave it out if it is the center")
-    return number
+def principal_point(values: Mapping[str, Any], size: tuple[int, int], where: str) -> tuple[float, float]:
+    """(cx, cy) px from the edges, each in the middle of its side of `size` (width, height) px if there is no value.
+
+    Raises SceneError for what seems to be in another unit: one of them alone may lie at the edge, as in a tile of a picture.
+    """
+    given = {key: numbers(values[key], (), f"{where}, {key}").item() for key in ("cx", "cy") if values.get(key) is not None}
+    if given and max(map(abs, given.values())) <= 1 < min(size) / 2:  # fractions of the image, or offsets from its center
+        said = " and ".join(f"{key} {number:g}" for key, number in given.items())
+        raise SceneError(f"{where}: has {said}, but must have pixels from the edge of the image; correct it, or leave it out if it is the center")
+    return given.get("cx", size[0] / 2), given.get("cy", size[1] / 2)

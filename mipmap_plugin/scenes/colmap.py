@@ -16,10 +16,11 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError, brief
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import pixels
-from mipmap_plugin.scenes.base import ABSENT, SPLIT, Scene, refuse_other_shape
+from mipmap_plugin.scenes.base import ABSENT, SPLIT, Scene, note_on_shapes, other_shape
 from mipmap_plugin.scenes.cameras_json import TEST_EVERY, numbers_views, photographs_folder, tests_by_lod, trained_size
 from mipmap_plugin.scenes.colmap_sizes import refuse_truncated
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, note
+from mipmap_plugin.scenes.listed_images import image_file
 
 if TYPE_CHECKING:
     import pycolmap
@@ -62,15 +63,16 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     cameras: list[Camera] = []
     photographs: dict[Camera, Path] = {}
     lenses: dict[Path, Lens] = {}
+    shapes: list[str] = []
     trained, unbent = count(), unbent_by(cfg)
     by_lod = tests_by_lod(len(images), cfg)
     tests = range(0, len(images), TEST_EVERY) if by_lod is None else by_lod
     for index, image in enumerate(images):
         camera = _camera(model, image, "test" if index in tests else "train", centered=bool(cfg))
-        photograph, lens = folder / image.name, _lens(model.cameras[image.camera_id], unbent)
+        photograph, lens = image_file(folder, image.name) or folder / image.name, _lens(model.cameras[image.camera_id], unbent)
         exists, options = is_file(photograph), cfg
         if exists:
-            refuse_other_shape((camera.width, camera.height), photograph, str(photograph))
+            shapes.append(other_shape((camera.width, camera.height), photograph, str(photograph)))
             size = image_size(photograph)
         if exists and not is_copy:
             options = {**cfg, "images": "images", "ds": 1}
@@ -85,6 +87,7 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         if exists:
             photographs[camera] = photograph
     notes = _notes(cameras, photographs, folder, None if by_lod is None else cfg["lod"]) + ([note(lenses.values())] if lenses else [])
+    notes += note_on_shapes(shapes)
     if is_copy:
         notes.append(f"there is no folder {photographs_folder(cfg)}: the photographs are those of {folder.name}")
     if models := sorted({lens.model for camera in model.cameras.values() if (lens := _lens(camera)) and lens.model in unbent}):

@@ -14,14 +14,13 @@ from torch import Tensor
 
 from mipmap_plugin.camera import OPENGL_TO_OPENCV, Camera
 from mipmap_plugin.errors import SceneError
-from mipmap_plugin.formats.images import image_size, is_file
+from mipmap_plugin.formats.images import image_size
 from mipmap_plugin.formats.json_file import ROTATION_TOLERANCE, numbers, pixels, positive, present, read_json, rotation
-from mipmap_plugin.scenes.base import ABSENT, MASKED, Scene, refuse_other_shape
+from mipmap_plugin.scenes.base import ABSENT, MASKED, Scene, note_on_shapes, other_shape
 from mipmap_plugin.scenes.cameras_json import numbers_views, principal_point, trained_size
 from mipmap_plugin.scenes.intrinsics import DISTORTION, overruled, values_of
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, can_undistort, note
-
-IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+from mipmap_plugin.scenes.listed_images import listed_images, place_of, stem_of
 
 PERSPECTIVE_MODELS = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
@@ -40,7 +39,7 @@ def read_transforms(path: str | Path, cfg: dict[str, Any] | None = None) -> Scen
     `cfg` is the checkpoint's cfg_args, whose `resolution` determines the training size; the principal point is moved to the center, as projects
     with cfg_args do. Without it the size is that of the images.
     `transforms_test.json` is the test split, or `transforms_val.json` if there is none; in a file that lists the frames of training
-    (`train_filenames`), as nerfstudio's may, all others are. A frame whose image is missing stays a
+    (`train_filenames`), as nerfstudio's may, all others are. A frame whose image is missing (`listed_images`) stays a
     view if the file states its size (`w`, `h`), and is left out otherwise; `notes` count both.
 
     Raises:
@@ -74,9 +73,12 @@ def transforms_files(path: Path) -> list[tuple[Path, Literal["train", "test"]]]:
         return [(path, "test" if path.stem.endswith(("_test", "_val")) else "train")]
     train = _first_file(path, "transforms_train.json", "transforms.json")
     test = _first_file(path, "transforms_test.json", "transforms_val.json")
-    if not train and not test:
+    others = [] if train or test else sorted(path.glob("transforms*.json"))  # such as transforms_undistorted.json of ScanNet++
+    if len(others) > 1:
+        raise SceneError(f"{path}: holds {', '.join(file.name for file in others)}; give one of these files")
+    if not train and not test and not others:
         raise SceneError(f"{path}: holds no transforms_train.json, transforms_test.json or transforms.json; give the folder that does")
-    return [*((file, "train") for file in train), *((file, "test") for file in test)]
+    return [*((file, "train") for file in train + others), *((file, "test") for file in test)]
 
 
 def viewmat_from_opengl(camera_to_world: Tensor) -> Tensor:
@@ -130,37 +132,47 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
         raise SceneError(f"{file}: {lacks}; give a NeRF-Synthetic, instant-ngp or nerfstudio transforms file")
     views: list[View] = []
     places: list[PurePosixPath] = []
-    absent, passed_over, trained = 0, 0, {_place(str(name)) for name in names} if isinstance(names := data.get("train_filenames"), list) else None
+    shapes: list[str] = []
+    absent, passed_over, trained = 0, 0, {place_of(str(name)) for name in names} if isinstance(names := data.get("train_filenames"), list) else None
     tests = tests if isinstance(tests := data.get("test_frames"), list) else []  # of ScanNet++
-    for index, frame in enumerate([*frames, *tests]):
-        where = f"{file}, frame {index}"
-        if not isinstance(frame, dict):
-            raise SceneError(f"{where}: is not a camera; export the file again")
+    every = [*frames, *tests]
+    images, copies = listed_images(file, [_listed(frame, f"{file}, frame {index}") for index, frame in enumerate(every)])
+    for index, (frame, image) in enumerate(zip(every, images, strict=True)):
+        where, listed = f"{file}, frame {index}", str(frame["file_path"])
         values = values_of(data, frame)
         passed_over += overruled(data, frame)
-        listed = str(present(frame, "file_path", where))
-        image = _image(file.parent, listed)
-        absent += image is None
         stated = _stated_size(values, where)
-        actual = image_size(image) if image else stated  # the image may have been shrunk since
+        image = None if copies and not stated else image  # a copy does not tell the size that the focal length is of
+        absent += image is None
+        actual = stated if stated and (copies or not image) else image and image_size(image)  # the image itself may have been shrunk since
         if actual:
-            name = image.stem if image else _stem(_place(listed).name)
+            name = image.stem if image else stem_of(listed)
             if trained is not None or index >= len(frames):
-                split = "train" if trained is not None and _place(listed) in trained else "test"
+                split = "train" if trained is not None and place_of(listed) in trained else "test"
             if stated and image:
-                refuse_other_shape(stated, image, f"{where} ({name})")
+                shapes.append(other_shape(stated, image, f"{where} ({name})"))
             model = _lens_model(values, f"{where} ({name})")
             camera = _camera(values, stated or actual, name, split, f"{where} ({name})").resized(*actual)
             lens = _lens(values, model, camera, f"{where} ({name})")
             views.append((lens.straightened(camera) if lens and can_undistort() else camera, image, lens))
-            places.append(_place(listed))
+            places.append(place_of(listed))
     unsized = absent - sum(image is None for _, image, _ in views)
     notes = [f"{file.name}: {_counted(absent)} {ABSENT}{_left_out(unsized)}"] if absent else []
+    notes += note_on_shapes(shapes)
+    if copies:
+        notes.append(f"{file.name}: the images that it lists are not there, and the photographs are those of {copies}")
     if passed_over:
         notes.append(f"{file.name}: the intrinsics of {passed_over} of its frames are passed over for those of the file, as in nerfstudio")
     if masked := sum(bool(frame.get("mask_path")) for frame in frames):
         notes.append(f"{file.name}: frames that are {MASKED} (mask_path): {masked}; masks are not read, so that what they hide counts like all else")
     return views, places, notes
+
+
+def _listed(frame: Any, where: str) -> str:
+    """The listed place of a frame's image. Raises SceneError for what is no frame."""
+    if not isinstance(frame, dict):
+        raise SceneError(f"{where}: is not a camera; export the file again")
+    return str(present(frame, "file_path", where))
 
 
 def _applied(file: Path) -> tuple[Tensor | None, float]:
@@ -171,22 +183,6 @@ def _applied(file: Path) -> tuple[Tensor | None, float]:
     elif file.name == "transforms.json" and (file.parent / "colmap/sparse/0").exists():
         transform = _pose(USUAL_TURN, str(file))
     return transform, positive(data.get("applied_scale", 1.0), f"{file}, applied_scale")
-
-
-def _place(listed: str) -> PurePosixPath:
-    """A listed name of a file, by which `./a` is the same as `a`."""
-    return PurePosixPath(listed.replace("\\", "/"))
-
-
-def _image(folder: Path, listed: str) -> Path | None:
-    """The image file of a `file_path`, which may lack its suffix; None if it is missing."""
-    stem = listed.replace("\\", "/")
-    return next((folder / f"{stem}{suffix}" for suffix in IMAGE_SUFFIXES if is_file(folder / f"{stem}{suffix}")), None)
-
-
-def _stem(name: str) -> str:
-    """The name of a view whose image is absent: that of the image, without the suffix if it has one."""
-    return next((name.removesuffix(suffix) for suffix in IMAGE_SUFFIXES[1:] if name.endswith(suffix)), name)
 
 
 def _stated_size(values: Mapping[str, Any], where: str) -> tuple[int, int] | None:
@@ -202,7 +198,7 @@ def _camera(values: Mapping[str, Any], size: tuple[int, int], name: str, split: 
     if fx is None:
         raise SceneError(f"{where}: has neither 'fl_x' nor 'camera_angle_x'; add one to the file")
     fy = _focal(values, "y", height, where) or fx
-    cx, cy = (principal_point(values.get(key), side, f"{where}, {key}") for key, side in (("cx", width), ("cy", height)))
+    cx, cy = principal_point(values, size, where)
     time = numbers(values["time"], (), f"{where}, time").item() if values.get("time") is not None else None
     return Camera(width, height, fx, fy, cx, cy, _viewmat(values, where), name, split, time)
 

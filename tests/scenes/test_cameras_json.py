@@ -152,6 +152,7 @@ def test_a_capture_sorted_by_name_holds_out_what_its_photographs_do(shared_data)
         ({"resolution": -1}, (1600, 1054)),  # 1054.57 is cut off
         ({"resolution": 400}, (400, 263)),  # 263.64 is cut off
         ({"resolution": -1, "images": "images_4"}, (1256, 828)),
+        ({"resolution": 1, "images": "images_2"}, (2513, 1656)),  # ImageMagick rounds 2512.5 up
         ({"resolution": 2, "images": "images_2"}, (1256, 828)),
         ({"resolution": 1, "images": "images"}, (5025, 3312)),
     ],

@@ -178,7 +178,7 @@ def test_without_a_test_file_val_is_the_test_split(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"cx": 0.5}, r"frame 0 \(r_0\), cx: is 0.5, but must be in pixels"),
+        ({"cx": 0.5}, r"frame 0 \(r_0\): has cx 0.5, but must have pixels"),
         ({"k1": "x"}, r"frame 0 \(r_0\), k1: is not made of numbers"),
         ({"camera_model": "EQUIRECTANGULAR"}, r"has a lens that is not perspective \(EQUIRECTANGULAR\)"),
         ({"camera_model": "EQUIRECTANGULAR", "fl_x": None}, r"has a lens that is not perspective \(EQUIRECTANGULAR\)"),
@@ -207,3 +207,10 @@ def test_zero_distortion_is_no_distortion(tmp_path, model):
 def test_a_file_without_frames_is_named(tmp_path, content, lacks):
     with pytest.raises(SceneError, match=lacks):
         read_transforms(write_json(tmp_path / "transforms.json", content))
+
+
+def test_a_photograph_that_was_cropped_a_little_is_told_of(tmp_path):
+    save_image(tmp_path / "train/r_0.png", 40, 28)
+    scene = read_transforms(write_json(tmp_path / "transforms.json", {"camera_angle_x": 0.8, "w": 40, "h": 30, "frames": [frame()]}))
+    [note] = scene.warnings()
+    assert "stretched to their shape, as in 3DGS (r_0.png has 40 x 28 px, its camera 40 x 30 px); if they were cropped, every figure is" in note

@@ -21,6 +21,7 @@ from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.scenes import DEFORMABLE, Scene, load_photographs
 from mipmap_plugin.scenes.base import SHAPE_TOLERANCE, SPLIT
+from mipmap_plugin.scenes.listed_images import stem_of, without_suffix
 
 # Cameras are in a world if they are nearer to its cameras than to those of the other by this factor: in neither, one is nearer by chance.
 FAR_NEARER = 0.1
@@ -45,8 +46,9 @@ class Photographs:
         self.cameras = list(self._originals)
         for view, original in self._originals.items():
             if (size := scene.image_size(original))[0] < (1 - SHAPE_TOLERANCE) * view.width:
+                remedy = f"give larger photographs, or leave them out, or, if it was trained on these, add --cameras {scene.source}"
                 small = f"{scene.images[original]} has {size[0]} x {size[1]} px, but the base was trained at {view.width} x {view.height} px"
-                raise SettingsError(f"{small}: made larger, it shows less than the base; give larger photographs, or leave them out")
+                raise SettingsError(f"{small}: made larger, it shows less than the base; {remedy}")
 
     def note(self, views: Sequence[Camera]) -> str:
         """How many of the views have a photograph. Raises SettingsError if none has."""
@@ -72,19 +74,26 @@ def at_density_of(cameras: Sequence[Camera], base: Sequence[Camera]) -> list[Cam
     """
     kinds, named = {(*view.size, view.fx, view.fy): view for view in base}, defaultdict[str, list[Camera]](list)
     for view in base:
-        named[Path(view.name).stem].append(view)  # several, where images of several folders have the same names
+        for name in names_of(view):
+            named[name].append(view)  # several, where images of several folders have the same names
     similar, similar_of_name = MostSimilar(list(kinds.values())), {name: MostSimilar(views) for name, views in named.items()}
 
     def at_density(camera: Camera) -> Camera:
-        own = named.get(Path(camera.name).stem, [])
-        view = similar_of_name.get(Path(camera.name).stem, similar)(camera)
-        ratio = view.fx / camera.fx
-        resized = camera.resized(max(1, round(camera.width * ratio)), max(1, round(camera.height * ratio)))
+        name = next((name for name in names_of(camera) if name in named), "")
+        own, view = named.get(name, []), similar_of_name.get(name, similar)(camera)
+        # Each side by itself: where the base's view is of the same field, the size is that of its training, however that was rounded.
+        sides = (camera.width * view.fx / camera.fx, camera.height * view.fy / camera.fy)
+        resized = camera.resized(*(max(1, round(side)) for side in sides))
         if camera.index is None and len(own) == 1 and view.split == camera.split:
             resized = replace(resized, index=view.index)
         return replace(resized, cx=resized.width / 2, cy=resized.height / 2) if _is_centered(view) else resized
 
     return [*map(at_density, cameras)]
+
+
+def names_of(camera: Camera) -> tuple[str, ...]:
+    """The names by which a view and its photograph are the same: with folders and, for 3DGS left these out until October 2024, without."""
+    return tuple(dict.fromkeys((without_suffix(camera.name), stem_of(camera.name))))
 
 
 def _is_centered(camera: Camera) -> bool:

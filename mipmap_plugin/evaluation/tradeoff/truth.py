@@ -17,7 +17,7 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.measure import RESIZED, resized_base, supersampled, views_seen
 from mipmap_plugin.evaluation.metrics import psnr
-from mipmap_plugin.evaluation.other_scene import of_another_scene
+from mipmap_plugin.evaluation.other_scene import of_another_scene, of_another_size
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, TruthView, photographed_views
 from mipmap_plugin.scenes import Scene, jittered
 from mipmap_plugin.scenes.trajectories import with_company
@@ -47,6 +47,8 @@ def photographs(model: Wrapped, scene: Scene, scale: float, most: int | None) ->
 
     Raises SettingsError if there are none, if they are too small, and if no other camera is left to adapt to.
     """
+    if doubt := of_another_size(model, scene):
+        warnings.warn(doubt, stacklevel=2)
     judged: dict[Camera, TruthView] = {view.camera: view for view in photographed_views(model, scene)}
     train = [camera for camera in model.cameras if camera.split == "train"] or model.cameras
     views, adapt_on = list(judged), _others(train, list(judged))

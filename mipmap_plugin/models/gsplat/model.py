@@ -168,11 +168,12 @@ def _parameters(splats: Mapping[str, Tensor], path: Path) -> dict[str, Tensor]:
 
 def _shrunk(cameras: Sequence[Camera], factor: int, capture: Capture) -> list[Camera]:
     """The cameras as in simple_trainer (examples/datasets/colmap.py): intrinsics divided by `factor`, then multiplied by the size of the
-    first photograph of images_<factor> divided by the truncated size. Without photographs, their size is assumed to be rounded."""
+    first photograph of images_<factor> divided by the truncated size. Without photographs, their size is assumed to be rounded, halves up."""
     if factor < 2 or not cameras:
         return list(cameras)
     first = cameras[0]
-    actual = (capture.smaller(factor) if capture.smaller else None) or (max(1, round(first.width / factor)), max(1, round(first.height / factor)))
+    assumed = [max(1, int(side / factor + 0.5)) for side in (first.width, first.height)]
+    actual = (capture.smaller(factor) if capture.smaller else None) or assumed
     across, down = (size / max(1, whole // factor) for size, whole in zip(actual, (first.width, first.height), strict=True))
     return [_divided(camera, factor, across, down) for camera in cameras]
 
