@@ -69,6 +69,14 @@ def test_a_zoom_in_starts_from_it_and_tells_so():
     assert report.curve[0].seconds > report.seconds["conversion"]
 
 
+def test_a_zoom_in_starts_without_it_where_that_is_better():
+    """At x1 the classic filter is wider than that of this base, which is wider than the classic one of x2."""
+    base = wrap_model(tiny.model(60, TrainedScale("mip", 0.1)), cameras=tiny.cameras(8), backend="cpu", threads=1)
+    validation = base.adapt(2, viewer="classic", **BRIEF).report.validation
+    direct = base.adapt(2, viewer="classic", **BRIEF, conversion_steps=0).report.validation
+    assert validation["the start, the closed form without the conversion"] == direct["the start, the closed form"]
+
+
 def test_views_that_lose_are_told_of_the_file_alone():
     """Of the conversion, which nobody sees, it was said too that it is the file, with other dB."""
     views = [replace(view, fx=times * view.fx, fy=times * view.fy) for view, times in zip(tiny.cameras(8), (1, 3) * 4, strict=True)]

@@ -97,6 +97,25 @@ def test_crispness_reaches_the_start():
     assert (crisp["opacities"] >= plain["opacities"]).all() and (crisp["scales"] < plain["scales"]).any()
 
 
+@pytest.mark.parametrize(
+    ("scale", "tried"),
+    [(1.05, [0.0, 0.5, 1.0]), (2, [0.0]), (1 / 2, [0.0])],
+    ids=["a small zoom-in", "one that does not tell", "a zoom-out"],
+)
+def test_a_start_without_steps_is_as_crisp_as_views_show(scale, tried, monkeypatch):
+    """At x1.05 thin wires were up to 0.5 dB worse than in the base."""
+    seen = []
+
+    def form(*arguments):
+        seen.append(arguments[-1].crispness)
+        return closed_form(*arguments)
+
+    monkeypatch.setattr(candidates, "closed_form", form)
+    monkeypatch.setattr(Validation, "quality", lambda *_: Quality(30.0 + len(seen), 30.0 + len(seen)))
+    adapted(scale=scale, recipe="instant")
+    assert seen == tried
+
+
 @pytest.mark.parametrize(("scale", "size"), [(2, mean_pixel_size), (1 / 2, pixel_size)])
 def test_a_zoom_in_is_formed_for_the_mean_of_the_views(scale, size, monkeypatch):
     forms = []

@@ -82,7 +82,7 @@ class Stages:
         stopped = session.ended is End.OBSERVER
         del session  # with the truths of its views
         half = config.model_copy(update={"time_budget_s": _half(config)} | ({"steps": 0} if stopped else {}))
-        request = replace(self.request, finer=FinerLevel(converted.model, 1.0, NAME, told=True), budget_share=SHARE)
+        request = replace(self.request, finer=FinerLevel(converted.model, 1.0, NAME, converts=True), budget_share=SHARE)
         with _kept_if_interrupted(converted.states):
             adapted = Session(request, scale, half, cameras, self.photographs).run(self.resume, self._further(converted.report))
         settings = {"time_budget_s": config.time_budget_s} | ({"steps": config.steps} if stopped else {})

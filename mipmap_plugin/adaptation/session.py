@@ -28,7 +28,7 @@ from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, color
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, option_note, simulated, versions
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer, ends_run
 from mipmap_plugin.adaptation.shown import refuse_blind, remarks, showing, too_unlike, worse_views
-from mipmap_plugin.adaptation.start.candidates import UNMATCHED, StartSearch
+from mipmap_plugin.adaptation.start.candidates import UNMATCHED, best_start
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
 from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.adaptation.target.detail import DetailLoss, unused_upsampler
@@ -118,10 +118,8 @@ class Session:
         began = now(self.device) - self.seconds["total"]
         self._compile()
         evaluate_moments(self.base, [*self.views, *self.validation.steering], self.phase)
-        search = StartSearch(self._start_problem())
-        initial, start = search.best()
-        self.notes = [note for note in search.notes if note == UNMATCHED or not (self.finer and self.finer.told)]
-        del search  # with the pairs of all rounds of merging
+        initial, start, notes = best_start(self._start_problems())
+        self.notes = [note for note in notes if note == UNMATCHED or not (self.finer and self.finer.converts)]
         states = {AS_IT_IS: self._for_target(self.request.base_in_viewer, shared=True), f"the start, {start}": initial}
         curve: list[CurvePoint] = []
         ended_by = "0 steps" + fewer_note(self.asked.steps, self.config.model_copy(update={"steps": 0}))
@@ -140,15 +138,16 @@ class Session:
             calls = calls_of(self.views, self.scale, self.config.views_per_step, gradients=takes_steps, merging=merging, by_rows=by_rows)
             warm_up(self.backend, self.base.gaussians(self.views[0]), effects, calls)
 
-    def _start_problem(self) -> StartProblem:
+    def _start_problems(self) -> list[StartProblem]:
         from_base = StartProblem(
             lambda: self._for_target(self.base, shared=True), self.base_views, self._closest_of, self.scale, self.base_effects,
             median_target(self.targets), self.config, self.backend, self._has_blend_weights, self.quality, self.phase,
             may_lose=self.config.merging_costs if len(self.targets) > 1 and self.config.steps else 0.0,
         )  # fmt: skip
         if (finer := self.finer) is None:
-            return from_base
-        return from_base.from_level(finer, lambda: self._for_target(finer.model, shared=True))
+            return [from_base]
+        from_level = from_base.from_level(finer, lambda: self._for_target(finer.model, shared=True))
+        return [from_level, from_base] if finer.converts and not self.config.time_budget_s else [from_level]
 
     def _select(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str) -> Adapted:
         """Return the best of the states on views that did not steer the run, or the last where the settings say so."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.optimization.amount import takes_steps
 from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.pixel_size import mean_pixel_size
 from mipmap_plugin.adaptation.start.base_weights import BaseWeights
@@ -29,6 +31,9 @@ from mipmap_plugin.screen_filters import INTEGRATED
 
 # The powers of `merge_to` that are tried: the last, the mildest, and then the others, until merging loses little enough.
 POWERS = (1, 1 / 2, 1 / 4)
+
+# Crispnesses also tried where a zoom-in below CRISPER_BELOW takes no steps: from there on the softest always looks best, shrunk, even of thin wires.
+CRISPER, CRISPER_BELOW = (0.5, 1.0), 2.0
 
 # dB that the mildest merging may cost before steps for a renderer that draws otherwise than the training did, even if the settings allow less: fewer
 # splats learn that sooner, and better. What stronger merging costs does not come back (docs/recipes_found.md).
@@ -77,6 +82,19 @@ def start_name(forms: bool, *, merged: bool = False, thinned: bool = False) -> s
 UNMATCHED = "the time budget left no time to fit opacities to what splats show in the base's images, so that the start has less dB than it could"
 
 
+@torch.no_grad()
+def best_start(problems: Sequence[StartProblem]) -> tuple[SplatModel, str, list[str]]:
+    """The best start, what it is called in the report, and what is to be said of it. `problems`: a second one is without the conversion of the first.
+
+    At x1 a viewer's filter may be wider than the base's, which takes from thin splats what a zoom-in, where that filter is narrower, needs.
+    """
+    searches = [StartSearch(problem) for problem in problems]
+    found = [search.best() for search in searches]
+    start, name = max(found, key=lambda each: problems[0].quality(each[0]).visible) if len(found) > 1 else found[0]
+    told = f"{name} without the conversion" if start is not found[0][0] else name
+    return start, told, [note for search in searches for note in search.notes]
+
+
 def mildest_costs(config: AdaptConfig, base: Effects, target: Effects) -> float:
     """dB that the mildest merging may cost."""
     learns = config.steps > 0 and base != target and config.merging_costs
@@ -88,7 +106,7 @@ class StartSearch:
 
     def __init__(self, problem: StartProblem) -> None:
         self._problem, self._rounds = problem, Rounds()
-        self._least = 0.0  # fraction of the rows that stay
+        self._least, self._crispness = 0.0, problem.config.crispness  # the fraction of the rows that stay, of a zoom-in how crisp it is
         budget, device = problem.config.time_budget_s, problem.base().parameters()["means"].device
         self._clock = Clock(START_SHARE * budget if budget else math.inf, device)
         self._seen = BaseWeights(problem, self._clock)
@@ -120,7 +138,7 @@ class StartSearch:
             formed = self._candidate(weights, 1.0)
         if config.merge_to == 1 and config.returns == "last":
             return formed, start_name(self._forms)
-        before, after = problem.quality(base), problem.quality(formed)
+        before, (formed, after) = problem.quality(base), self._as_crisp_as_shown(formed, weights)
         if self._alike and after.visible < before.visible:  # the filter itself is the better answer, for merged splats too
             self._forms, after = False, before
         bounds = Bounds(self._least_psnr(after), before.visible - problem.may_lose, after.psnr)
@@ -130,6 +148,20 @@ class StartSearch:
         if merged is not None:
             return merged, start_name(self._forms, merged=True, thinned=base.traits.thins)
         return (formed, start_name(True)) if self._forms and after.visible >= before.visible else (base, problem.name)
+
+    def _as_crisp_as_shown(self, formed: SplatModel, weights: Tensor | None) -> tuple[SplatModel, Quality]:
+        """The closed form, or a crisper one where a small zoom-in takes no steps and looks better by that; and its quality."""
+        problem, quality = self._problem, self._problem.quality(formed)
+        still = self._forms and not takes_steps(problem.config, problem.scale, problem.base_effects, [problem.target])
+        for crispness in CRISPER if still and 1 < problem.scale < CRISPER_BELOW else ():
+            if crispness > (before := self._crispness) and self._clock.allows("candidate"):
+                self._crispness = crispness
+                crisper = self._candidate(weights, 1.0)
+                if (better := problem.quality(crisper)).visible <= quality.visible:
+                    self._crispness = before
+                    break
+                formed, quality = crisper, better
+        return formed, quality
 
     def _merged_at_once(self, weights: Tensor | None) -> SplatModel | None:
         """The strongest merging, where a time budget is too short for a search and this is no worse than the base; else None."""
@@ -244,7 +276,7 @@ class StartSearch:
         area_power = 1.0 if rounds else AREA_POWER
         pixel = self._seen.pixel_size(gaussians.means)
         formed_for = mean_pixel_size(gaussians.means, problem.closest_of, self._seen.count) if problem.scale > 1 else pixel
-        settings = FormSettings(area_power, problem.config.crispness, self._seen.count, formed_for, matched=rounds > 0)
+        settings = FormSettings(area_power, self._crispness, self._seen.count, formed_for, matched=rounds > 0)
         scales, opacities = closed_form(gaussians, problem.views, problem.scale, problem.base_effects, problem.target, settings)
         if weights is None or not rounds:
             return scales, opacities

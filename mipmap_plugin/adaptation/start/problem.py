@@ -21,7 +21,7 @@ class FinerLevel:
     model: SplatModel
     scale: float
     name: str = "the finer level"  # what it is called in the report
-    told: bool = False  # what its views show of the base was told when it was made
+    converts: bool = False  # it is the conversion at x1 before a zoom-in; what its views show of the base was told when it was made
 
 
 @dataclass(frozen=True, eq=False)
