@@ -27,8 +27,10 @@ from mipmap_plugin.adaptation.start.closed_form import closed_form
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
 from mipmap_plugin.backends import gsplat, inria
+from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.backends.conformance.cases import covariances
 from mipmap_plugin.backends.cpu import nearest_along
+from mipmap_plugin.backends.guarded import Guarded
 from mipmap_plugin.cli import main
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import SURFEL, Effects
@@ -212,6 +214,17 @@ def test_images_of_a_step_are_compared_together_there(scale):
 
     few, many = (cost(lambda splats, count=count: compare(splats, count)) for count in (2, 5))
     assert few == many
+
+
+def test_an_image_of_a_third_party_is_looked_at_in_one_wait_there():
+    view = tiny.cameras()[0]
+
+    def draw(splats, camera, effects):
+        black = splats.means.new_zeros(*camera.size, 3)
+        return Rendered(black, black[..., 0])
+
+    _, waits = cost(lambda splats: Guarded("mine", SimpleNamespace(render=draw)).render(splats, view, Effects(1)))
+    assert waits == 1
 
 
 def test_a_check_waits_once_there():
