@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -50,6 +51,7 @@ class OnProcessor(GsplatBackend):
 def stand_in(monkeypatch):
     twin = StandIn()
     monkeypatch.setattr(gsplat, "rasterization", twin)
+    monkeypatch.setattr(module, "unloadable", lambda: "")
     return twin
 
 
@@ -124,6 +126,21 @@ def test_what_is_missing_is_reported(monkeypatch):
     assert "not in torch.float64" in GsplatBackend().lacking(replace(USUAL, dtype=torch.float64))[0]
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert GsplatBackend().lacking(USUAL) == [NO_GSPLAT]
+
+
+@pytest.mark.parametrize(("loaded", "said"), [(RuntimeError("Error building extension 'gsplat_cuda'\n..."), "Error building"), (None, NOT_COMPILED)])
+def test_a_cuda_part_that_does_not_load_is_said_in_a_sentence(loaded, said, monkeypatch):
+    def load(name):
+        if isinstance(loaded, Exception):
+            raise loaded
+        return SimpleNamespace(_C=loaded)
+
+    monkeypatch.setattr(module.importlib, "import_module", load)
+    module.unloadable.cache_clear()
+    with pytest.raises(BackendUnavailable, match="backend 'gsplat' cannot do this: ") as caught:
+        OnProcessor().render(gaussians(2, dtype=torch.float32), WIDE, Effects(1))
+    module.unloadable.cache_clear()
+    assert said in str(caught.value)
 
 
 def test_it_is_listed_with_its_reasons_and_refuses(monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import anchor_checkpoints
 import mip_checkpoints
@@ -16,6 +17,7 @@ import torch_checkpoints
 
 from mipmap_plugin import load_model, load_scene, wrap_model
 from mipmap_plugin.adaptation.optimization import run
+from mipmap_plugin.adaptation.optimization.loop import _compare_all
 from mipmap_plugin.adaptation.optimization.validation import Validation
 from mipmap_plugin.adaptation.pixel_size import mean_pixel_size
 from mipmap_plugin.adaptation.shown import remarks, showing
@@ -25,9 +27,12 @@ from mipmap_plugin.adaptation.start.closed_form import closed_form
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
 from mipmap_plugin.backends import gsplat, inria
+from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.backends.conformance.cases import covariances
 from mipmap_plugin.backends.cpu import nearest_along
+from mipmap_plugin.backends.guarded import Guarded
 from mipmap_plugin.cli import main
+from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.evaluation.evaluate import all_rows, evaluator_of
 from mipmap_plugin.formats.images import write_image
@@ -197,6 +202,29 @@ def test_views_are_looked_at_together_there():
     ):
         few, many = (cost(lambda splats, views=views, look=look: look(splats, views)) for views in map(tiny.cameras, (3, 9)))
         assert few == many
+
+
+@pytest.mark.parametrize("scale", [1 / 4, 2])
+def test_images_of_a_step_are_compared_together_there(scale):
+    task, config = SimpleNamespace(scale=scale, detail=None), AdaptConfig(loss="psnr", compare_at="base")
+
+    def compare(splats, count):
+        image, truth = splats.means[None], splats.scales[None]  # as [h, w, 3]
+        _compare_all(task, config, [None] * count, [image] * count, [truth] * count)
+
+    few, many = (cost(lambda splats, count=count: compare(splats, count)) for count in (2, 5))
+    assert few == many
+
+
+def test_an_image_of_a_third_party_is_looked_at_in_one_wait_there():
+    view = tiny.cameras()[0]
+
+    def draw(splats, camera, effects):
+        black = splats.means.new_zeros(*camera.size, 3)
+        return Rendered(black, black[..., 0])
+
+    _, waits = cost(lambda splats: Guarded("mine", SimpleNamespace(render=draw)).render(splats, view, Effects(1)))
+    assert waits == 1
 
 
 def test_a_check_waits_once_there():

@@ -18,7 +18,7 @@ from mipmap_plugin.backends import BACKENDS, survey
 from mipmap_plugin.backends.base import AdamStep, Calls, Needs
 from mipmap_plugin.backends.conformance import check_backend
 from mipmap_plugin.backends.external import NO_CUDA
-from mipmap_plugin.backends.triton import NO_TRITON, TritonBackend, interpreted
+from mipmap_plugin.backends.triton import NO_TRITON, TritonBackend, interpreted, unbuilt
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.splatting.viewers import find_viewer
@@ -183,12 +183,29 @@ def test_what_is_missing_is_reported(monkeypatch):
     assert TritonBackend().lacking(USUAL) == [NO_TRITON if MISSING else NO_CUDA]
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr("mipmap_plugin.backends.triton.unbuilt", lambda: [])
     assert TritonBackend().lacking(USUAL) == []
     assert TritonBackend().lacking(replace(USUAL, screen_filter="window")) == ["it has the screen filters antialiased, classic, mip, not window"]
     monkeypatch.setattr("mipmap_plugin.backends.triton.version", lambda name: "3.2.0")
     assert TritonBackend().lacking(USUAL) == ["it needs triton 3.3 or newer, which comes with torch 2.7; 3.2.0 is installed"]
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert TritonBackend().lacking(USUAL) == [NO_TRITON]
+
+
+@not_old
+def test_without_a_compiler_for_its_launcher_another_backend_is_taken(monkeypatch):
+    class Driver:
+        @property
+        def active(self):
+            raise RuntimeError("Failed to find C compiler.")
+
+    monkeypatch.setitem(sys.modules, "triton.runtime", SimpleNamespace(driver=Driver()))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    unbuilt.cache_clear()
+    [reason] = TritonBackend().lacking(USUAL)
+    unbuilt.cache_clear()
+    assert "cannot build what launches its kernels (Failed to find C compiler.); " in reason and "install gcc and python3-dev" in reason
 
 
 @not_old

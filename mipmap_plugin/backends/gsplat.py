@@ -20,6 +20,7 @@ import importlib
 import importlib.util
 import math
 import shutil
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +31,11 @@ from mipmap_plugin.backends.external import NO_CUDA, CachedCheck, finite_splats,
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.errors import install
+from mipmap_plugin.errors import BackendUnavailable, brief, install
 from mipmap_plugin.gaussians import Gaussians
 
 NO_GSPLAT = f"it needs gsplat; {install('gsplat')}"
+CUDA_PART = "gsplat.cuda._backend"
 NOT_COMPILED = "gsplat's CUDA part is not compiled and there is no nvcc to compile it with; install its wheel for your torch and CUDA"
 
 
@@ -60,6 +62,8 @@ class GsplatBackend:
         The host synchronizes with the GPU twice: here for whether all splats are finite, in gsplat for the number of (splat, tile) pairs.
         """
         self._check.require(Needs.of(gaussians, effects, gradients=True))
+        if reason := unloadable():
+            raise BackendUnavailable(f"backend 'gsplat' cannot do this: {reason}")
         gaussians = finite_splats(gaussians)
         if len(gaussians) == 0:
             return ReferenceBackend().render(gaussians, camera, effects)
@@ -77,6 +81,19 @@ def missing() -> list[str]:
     folders = [Path(folder) for folder in spec.submodule_search_locations or ()]
     compiled = any(file.suffix in {".so", ".pyd"} for folder in folders for file in folder.glob("csrc.*"))
     return [] if compiled or _nvcc() else [NOT_COMPILED]
+
+
+@cache
+def unloadable() -> str:
+    """Why gsplat's CUDA part, which compiles for minutes when it is first imported, does not load; empty if it does."""
+    if importlib.util.find_spec(CUDA_PART) is None:  # in a version that keeps it elsewhere
+        return ""
+    try:
+        loaded = getattr(importlib.import_module(CUDA_PART), "_C", None) is not None
+    except Exception as error:  # compilers and linkers fail in any way
+        advice = "install its wheel for your torch and CUDA, or choose another backend"
+        return f"gsplat's CUDA part does not compile or load here ({brief(error)}); {advice}"
+    return "" if loaded else NOT_COMPILED
 
 
 def arguments(gaussians: Gaussians, camera: Camera, effects: Effects) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -58,15 +59,15 @@ class Guarded:
             raise PluginError(f"{self._title} has to return images of the splats' type {gaussians.means.dtype}; it returned {image.dtype}")
         if image.device != gaussians.means.device:
             raise PluginError(f"{self._title} has to return images on the splats' device {gaussians.means.device}; it returned one on {image.device}")
-        if not image.isfinite().all():
+        least, largest = torch.stack(image.detach().aminmax()).tolist()  # NaN if there is one; a GPU is waited for once
+        if not (math.isfinite(least) and math.isfinite(largest)):
             view = f"{camera.name or 'a view'}, {camera.width} x {camera.height} px"
             raise PluginError(f"{self._title} returned an image with NaN or infinity, of {view}")
-        self._check_colors(image.detach(), gaussians, effects)
+        self._check_colors(largest, gaussians, effects)
         return rendered.replaced(image=self._joined(image, gaussians, effects), alpha=partial(self._alpha, rendered, image))
 
-    def _check_colors(self, image: Tensor, gaussians: Gaussians, effects: Effects) -> None:
+    def _check_colors(self, largest: float, gaussians: Gaussians, effects: Effects) -> None:
         """Raise PluginError for colors far beyond those of the splats and the background, between which blending stays: of 0..255, for example."""
-        largest = float(image.amax())
         if largest <= BRIGHT:  # as most images; to look at all splats takes a moment
             return
         most = max(*effects.background, 0.5 + float(gaussians.sh.detach().abs().sum(1).amax()) if len(gaussians) else 0.0)
@@ -155,7 +156,8 @@ class _GuardedStepper:
     def step(self, step: AdamStep) -> None:
         with naming(self._title):
             self._theirs.step(step)
-        if wrong := [name for name, tensor in step.raw.items() if not tensor.isfinite().all()]:
+        finite = torch.stack([tensor.isfinite().all() for tensor in step.raw.values()]).tolist()  # a GPU is waited for once
+        if wrong := [name for name, whole in zip(step.raw, finite, strict=True) if not whole]:
             raise PluginError(f"{self._title}: a step left NaN or infinity in {', '.join(wrong)}")
 
 

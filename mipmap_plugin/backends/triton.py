@@ -13,10 +13,12 @@ tile) pair; so are blend weights, for 4.
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +31,7 @@ from mipmap_plugin.backends.external import NO_CUDA, CachedCheck
 from mipmap_plugin.backends.linear_light import in_linear_light
 from mipmap_plugin.camera import ONE_PIXEL, Camera
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import brief
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.process.torch_modes import opaque
 from mipmap_plugin.splatting.buckets import ranks_of_views
@@ -143,7 +146,20 @@ def missing() -> list[str]:
         installed = version("triton")
         if tuple(int(part) for part in installed.split(".")[:2]) < OLDEST:
             return [f"it needs triton {'.'.join(map(str, OLDEST))} or newer, which comes with torch 2.7; {installed} is installed"]
-    return [] if interpreted() or torch.cuda.is_available() else [NO_CUDA]
+    if interpreted():
+        return []
+    return unbuilt() if torch.cuda.is_available() else [NO_CUDA]
+
+
+@cache
+def unbuilt() -> list[str]:
+    """Why Triton cannot build what launches kernels, which takes a C compiler, Python's headers and the driver's library; empty if it can."""
+    try:
+        importlib.import_module("triton.runtime").driver.active.utils  # noqa: B018  # it is built, once on a machine, when it is first asked for
+    except Exception as error:  # compilers, linkers and drivers fail in any way
+        advice = "it takes a C compiler and Python's headers: install gcc and python3-dev"
+        return [f"triton cannot build what launches its kernels ({brief(error)}); {advice}"]
+    return []
 
 
 class _Draw(torch.autograd.Function):

@@ -190,19 +190,23 @@ def _compare_all(
     task: Task, config: AdaptConfig, views: Sequence[Camera], images: Sequence[Tensor], targets: Sequence[Tensor]
 ) -> list[tuple[Tensor, Tensor]]:
     """`_compare` of several views: in one operation where their images are of one size, since a GPU waits for each."""
-    if task.scale > 1 and config.compare_at == "base":
-        images = [image.detach().clamp_max(1) for image in images]
-    elif task.scale <= 1 and config.loss == "psnr":
-        images = [image.detach().minimum(target.clamp_min(1) + BEYOND_WHITE) for image, target in zip(images, targets, strict=True)]
     if len(images) == 1 or task.detail is not None or len({image.shape for image in (*images, *targets)}) > 1:
         return [_compare(task, config, *each) for each in zip(views, images, targets, strict=True)]
-    gradients, square_errors = gradient_of(torch.stack(list(images)).detach() - torch.stack(list(targets)), config.loss)
+    target = torch.stack(list(targets))
+    gradients, square_errors = gradient_of(_shown(torch.stack(list(images)).detach(), target, task, config) - target, config.loss)
     return list(zip(gradients.unbind(), square_errors.unbind(), strict=True))
+
+
+def _shown(image: Tensor, target: Tensor, task: Task, config: AdaptConfig) -> Tensor:
+    """An image [..., h, w, 3] as far as a display shows it, which counts (BEYOND_WHITE). It is not changed in place: a backend may still need it."""
+    if task.scale > 1 and config.compare_at == "base":
+        return image.clamp_max(1)
+    return image.minimum(target.clamp_min(1) + BEYOND_WHITE) if task.scale <= 1 and config.loss == "psnr" else image
 
 
 def _compare(task: Task, config: AdaptConfig, view: Camera, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """The gradient of the loss of an image, [h, w, 3], and its mean square error, []."""
-    image = image.detach()
+    image = _shown(image.detach(), target, task, config)
     if task.detail is None:
         gradient, square_error = gradient_of(difference_from(target, image, config.resize), config.loss)
         return gradient_before(gradient, (image.shape[0], image.shape[1]), config.resize), square_error
