@@ -60,10 +60,14 @@ class Gaussians:
             rows = rows.nonzero()[:, 0]  # once for all tensors: a GPU is waited for
         return self._map(lambda tensor: tensor[rows])
 
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensors by name; without `covariances` where there are none."""
+        held = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: tensor for name, tensor in held.items() if tensor is not None}
+
     def joined(self, other: Gaussians) -> Gaussians:
         """These splats, then those of `other`, which has covariances if these have."""
-        names = [f.name for f in fields(self) if getattr(self, f.name) is not None]
-        return replace(self, **{name: torch.cat([getattr(self, name), getattr(other, name)]) for name in names})
+        return replace(self, **{name: torch.cat([tensor, getattr(other, name)]) for name, tensor in self.tensors().items()})
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Gaussians:
         """The same splats on `device` in `dtype`."""
@@ -87,5 +91,4 @@ class Gaussians:
         return next((degree for degree in bands if sh[:, degree**2 : (degree + 1) ** 2].count_nonzero()), 0)
 
     def _map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
-        tensors = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{name: function(tensor) for name, tensor in tensors.items() if tensor is not None})
+        return replace(self, **{name: function(tensor) for name, tensor in self.tensors().items()})

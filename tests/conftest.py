@@ -60,9 +60,9 @@ def nothing_that_is_registered_stays():
         yield
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def small_orbits(monkeypatch):
-    """Views of a generated orbit of 24 px, in place of 800: for tests of a file without cameras, whose pictures do not matter."""
+    """Views of a generated orbit have 24 px, in place of 800: no test of a file without cameras is about its pictures."""
     monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 24)
 
 

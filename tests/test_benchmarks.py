@@ -199,8 +199,7 @@ def test_smaller_cameras_of_a_capture_are_those_of_its_base():
     assert {(view.width, view.zoom) for view in (*judged, *others)} == {(base.cameras[0].width // 2, 1.0)}
 
 
-def test_a_capture_without_cameras_is_judged_on_views_that_no_seed_of_adapting_draws(monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 24)
+def test_a_capture_without_cameras_is_judged_on_views_that_no_seed_of_adapting_draws():
     base = wrap_model(tiny.model(), cameras=[])
     judged, others = unbounded.split(base, unbounded.Capture("ball", (0.25,)))
     adapted = base.adapt(0.25, recipe="instant", cameras=others or None)

@@ -209,7 +209,6 @@ def registered(path, load=lambda path, iteration: model(), **changes):
     return path
 
 
-@pytest.mark.usefixtures("small_orbits")
 def test_levels_of_a_family_that_writes_no_ply_end_in_a_sentence(tmp_path, capsys):
     own = type("Own", (Theirs,), {"save": save_as_text})
     file = registered(tmp_path / "a.own", lambda path, iteration: own(tiny.model().parameters(), TrainedScale(), Origin(path)))

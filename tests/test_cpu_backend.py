@@ -7,7 +7,7 @@ import math
 import os
 import subprocess
 import sys
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -43,8 +43,7 @@ def threads_for_any_work(monkeypatch):
 
 
 def leaf(g: Gaussians) -> Gaussians:
-    tensors = {f.name: getattr(g, f.name) for f in fields(g)}
-    return Gaussians(**{name: t if t is None else t.detach().clone().requires_grad_() for name, t in tensors.items()})
+    return Gaussians(**{name: tensor.detach().clone().requires_grad_() for name, tensor in g.tensors().items()})
 
 
 def gradients(image: torch.Tensor, alpha: torch.Tensor, g: Gaussians) -> dict[str, torch.Tensor]:
@@ -52,7 +51,7 @@ def gradients(image: torch.Tensor, alpha: torch.Tensor, g: Gaussians) -> dict[st
     weights = torch.randn(*alpha.shape, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64).to(image)
     loss = (image * weights[..., :3]).sum() + (alpha * weights[..., 3]).sum()
     loss.backward()
-    return {f.name: getattr(g, f.name).grad.double() for f in fields(g) if getattr(getattr(g, f.name), "grad", None) is not None}
+    return {name: tensor.grad.double() for name, tensor in g.tensors().items() if tensor.grad is not None}
 
 
 def draw(g: Gaussians, view, effects: Effects):
@@ -217,7 +216,7 @@ def test_packed_views_are_packed_for_each_camera():
 @pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "sh"])
 def test_a_row_with_nan_changes_no_other_row(field):
     g = gaussians(50, dtype=torch.float32)
-    tensors = {f.name: getattr(g, f.name).clone() for f in fields(g) if getattr(g, f.name) is not None}
+    tensors = {name: tensor.clone() for name, tensor in g.tensors().items()}
     tensors[field][20] = math.nan
     rest = torch.arange(50) != 20
     image, _, grads = draw(Gaussians(**tensors), camera(), Effects(1))

@@ -118,7 +118,6 @@ def test_a_file_for_a_viewer_of_a_package_that_is_absent_says_so(tmp_path, capsy
     assert main([*words, "--viewer", "spark"]) == 0
 
 
-@pytest.mark.usefixtures("small_orbits")
 def test_the_scale_is_read_from_the_header_or_from_the_report(tmp_path):
     base = wrap_model(tiny.ply(tmp_path / "base.ply"))
     saved = base.adapt(2, recipe="instant").save(tmp_path / "a.ply")

@@ -11,7 +11,6 @@ import torch
 from torch_checkpoints import gsplat_folder, splatfacto_folder, splats
 
 from mipmap_plugin import wrap_model
-from mipmap_plugin.adaptation import views
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models.adapted_scale import adapted_orbit
@@ -20,11 +19,6 @@ pytestmark = pytest.mark.usefixtures("few_views")
 
 SCALE = 0.125
 Z = (0.0, 0.0, 1.0)
-
-
-@pytest.fixture(autouse=True)
-def _small_pictures(monkeypatch):
-    monkeypatch.setattr(views, "ORBIT_PIXELS", 16)
 
 
 def poses(path, **options) -> torch.Tensor:
@@ -128,7 +122,7 @@ def test_with_what_is_up_as_many_views_look_from_above_the_horizon(files):
     assert max(abs(float(view.viewmat[0, 0])) for view in above.views()) < 1e-9  # no picture is rolled
     adapted = above.adapt(SCALE, recipe="instant", extra_views=8)
     assert min(-height for height in heights(adapted.adapted_to, 0)) > -0.18
-    assert adapted.report.views == "8 views of a generated orbit from above the horizon, with -x up, at 16 px (the checkpoint came without cameras)"
+    assert adapted.report.views == "8 views of a generated orbit from above the horizon, with -x up, at 24 px (the checkpoint came without cameras)"
 
 
 def test_an_adapted_file_keeps_what_was_up_unless_it_is_said_anew(tmp_path, files):

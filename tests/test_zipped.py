@@ -46,7 +46,6 @@ def test_one_ply_is_read_wherever_its_name_leads(tmp_path, ply, name):
     assert {path.name for path in tmp_path.iterdir()} == before | {"phone.zip"}
 
 
-@pytest.mark.usefixtures("small_orbits")
 def test_adapt_writes_a_ply_beside_it(tmp_path, ply):
     archive(tmp_path / "phone.zip", {"scan.ply": ply})
     assert main(["adapt", str(tmp_path / "phone.zip"), "--scale", "1/2", "--recipe", "instant"]) == 0
@@ -82,7 +81,6 @@ def test_what_is_doubtful_is_told_by_the_archives_name(tmp_path, ply):
         load_model(archive(tmp_path / "one.zip", {"a.ply": write(tmp_path / "one.ply", columns).read_bytes()}))
 
 
-@pytest.mark.usefixtures("small_orbits")
 def test_a_ply_that_is_no_base_is_told_of_by_the_archives_name(tmp_path, ply):
     cloud = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
     refused(archive(tmp_path / "mesh.zip", {"a.ply": cloud}), "the PLY in .*mesh.zip is a plain point cloud")

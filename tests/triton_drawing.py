@@ -6,7 +6,6 @@ import importlib.util
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields
 
 import pytest
 import torch
@@ -31,14 +30,12 @@ WIDE = camera(40, 24, 30.0, 26.0, cx=18.3, cy=13.9)
 
 def draw(backend, g: Gaussians, view, effects: Effects):
     """Image, alpha, and the gradients of a fixed weighted sum of all pixels by the name of the tensor."""
-    tensors = {f.name: getattr(g, f.name) for f in fields(g)}
-    g = Gaussians(**{name: t if t is None else t.detach().clone().requires_grad_() for name, t in tensors.items()})
+    g = Gaussians(**{name: tensor.detach().clone().requires_grad_() for name, tensor in g.tensors().items()})
     rendered = backend(g, view, effects)
     image, alpha = (rendered.image, rendered.alpha) if hasattr(rendered, "image") else rendered
     weights = torch.randn(*alpha.shape, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64).to(image)
     ((image * weights[..., :3]).sum() + (alpha * weights[..., 3]).sum()).backward()
-    grads = {f.name: getattr(g, f.name).grad for f in fields(g) if getattr(g, f.name) is not None}
-    return image.detach(), alpha.detach(), {name: grad for name, grad in grads.items() if grad is not None}
+    return image.detach(), alpha.detach(), {name: tensor.grad for name, tensor in g.tensors().items() if tensor.grad is not None}
 
 
 def triton_result(g: Gaussians, view=WIDE, effects: Effects = Effects(1)):  # noqa: B008

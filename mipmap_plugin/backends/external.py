@@ -7,6 +7,7 @@ from torch import Tensor
 
 from mipmap_plugin.backends.base import Backend, Needs
 from mipmap_plugin.backends.reference import finite_rows
+from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.rotations import unit
@@ -28,6 +29,13 @@ class CachedCheck:
         if reasons:
             raise BackendUnavailable(f"backend {self._backend.name!r} cannot do this: {'; '.join(reasons)}")
         self._served.add(needs)
+
+
+def at_the_origin(camera: Camera) -> Camera:
+    """The camera moved to the origin, with the same rotation."""
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = camera.viewmat[:3, :3]
+    return camera.looking_from(viewmat, camera.name)
 
 
 def finite_splats(gaussians: Gaussians) -> Gaussians:

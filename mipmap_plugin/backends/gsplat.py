@@ -27,7 +27,7 @@ from typing import Any
 import torch
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.external import NO_CUDA, CachedCheck, finite_splats, normalized
+from mipmap_plugin.backends.external import NO_CUDA, CachedCheck, at_the_origin, finite_splats, normalized
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -98,8 +98,6 @@ def unloadable() -> str:
 
 def arguments(gaussians: Gaussians, camera: Camera, effects: Effects) -> dict[str, Any]:
     """The arguments of `gsplat.rasterization` for N > 0 splats and one camera."""
-    viewmat = torch.eye(4, dtype=camera.viewmat.dtype)
-    viewmat[:3, :3] = camera.viewmat[:3, :3]
     intrinsics = [[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]]
     means = gaussians.means
     return {
@@ -110,7 +108,7 @@ def arguments(gaussians: Gaussians, camera: Camera, effects: Effects) -> dict[st
         "opacities": gaussians.opacities,
         "colors": gaussians.sh,
         "sh_degree": min(effects.sh_degree, gaussians.sh_degree),
-        "viewmats": viewmat.to(means)[None],
+        "viewmats": at_the_origin(camera).viewmat.to(means)[None],
         "Ks": means.new_tensor(intrinsics)[None],
         "width": camera.width,
         "height": camera.height,

@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.external import NO_CUDA, CachedCheck, finite_splats, normalized
+from mipmap_plugin.backends.external import NO_CUDA, CachedCheck, at_the_origin, finite_splats, normalized
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -150,13 +150,6 @@ def splats_of(gaussians: Gaussians) -> dict[str, Tensor]:
         shape = {"cov3D_precomp": gaussians.covariances.flatten(1)[:, [0, 1, 2, 4, 5, 8]]}
     means = gaussians.means
     return {"means3D": means, "means2D": torch.zeros_like(means), "opacities": gaussians.opacities[:, None], **shape}
-
-
-def at_the_origin(camera: Camera) -> Camera:
-    """The camera moved to the origin, with the same rotation."""
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = camera.viewmat[:3, :3]
-    return camera.looking_from(viewmat, camera.name)
 
 
 def rescaled(gaussians: Gaussians, camera: Camera, factor: float) -> Gaussians:

@@ -85,12 +85,20 @@ class _Shared:
                 self._callers = None
 
 
+# How a setting of torch is read, and how it is set.
+_Setting = tuple[Callable[[], Any], Callable[[Any], object]]
+
+
+def _fp32_precision(kind: Any) -> _Setting:
+    return partial(getattr, kind, "fp32_precision"), partial(setattr, kind, "fp32_precision")
+
+
 def _precisions() -> list[_Shared]:
     """How products of float32 matrices are rounded: a GPU may have been asked for TF32, with 3 decimal digits, a processor for bfloat16."""
     if not hasattr(torch.backends, "fp32_precision"):  # before torch 2.9
         return [_Shared(torch.get_float32_matmul_precision, torch.set_float32_matmul_precision, "highest")]
     kinds: tuple[Any, ...] = (torch.backends.cuda.matmul, torch.backends.mkldnn.matmul)  # type: ignore[attr-defined]  # torch's
-    return [_Shared(partial(getattr, kind, "fp32_precision"), partial(setattr, kind, "fp32_precision"), "ieee") for kind in kinds]
+    return [_Shared(*_fp32_precision(kind), "ieee") for kind in kinds]
 
 
 _shared = [_Shared(torch.get_default_dtype, torch.set_default_dtype, torch.float32), *_precisions()]
@@ -113,12 +121,8 @@ def _set_older_precision(precision: str) -> None:
         torch.set_float32_matmul_precision(precision)
 
 
-# How a setting of torch is read, and how it is set.
-_Setting = tuple[Callable[[], Any], Callable[[Any], object]]
-
 # The older functions set the newer precisions too, and refuse to tell what these were set to by themselves.
-_all_products: list[Any] = [torch.backends] if hasattr(torch.backends, "fp32_precision") else []
-_newer: list[_Setting] = [(partial(getattr, kind, "fp32_precision"), partial(setattr, kind, "fp32_precision")) for kind in _all_products]
+_newer: list[_Setting] = [_fp32_precision(torch.backends)] if hasattr(torch.backends, "fp32_precision") else []
 _newer += [(setting.read, setting.write) for setting in _precisions()]
 
 # What a module may set for all of torch, most often at its top.

@@ -14,8 +14,7 @@ from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
 
 
-def test_a_bare_file_without_cameras_adapts_on_an_orbit(tmp_path, monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 24)
+def test_a_bare_file_without_cameras_adapts_on_an_orbit(tmp_path):
     adapted = wrap_model(tiny.ply(tmp_path / "base.ply")).adapt(1 / 4, steps=2, extra_views=3)
     assert adapted.report.views == "3 views of a generated orbit at 24 px (the checkpoint came without cameras)"
     assert is_finite(adapted.model)
@@ -46,7 +45,6 @@ def test_a_scene_of_which_most_is_before_the_near_plane_is_told_of():
         base.adapt(1 / 2, recipe="instant")
 
 
-@pytest.mark.usefixtures("small_orbits")
 def test_without_cameras_the_orbit_is_told_of(recwarn):
     wrap_model(tiny.model()).adapt(1 / 2, steps=0, extra_views=2, merge_to=1.0)
     assert [each for each in recwarn if str(each.message).startswith("no cameras are known: views of a generated orbit")]
@@ -102,7 +100,8 @@ def test_a_scene_nearer_than_the_near_plane_is_refused_with_what_to_do():
         wrap_model(small, cameras=views).adapt(0.5, steps=0, views="given")
 
 
-def test_a_scene_in_small_units_is_told_of_where_the_near_plane_keeps_an_orbit_away_from_it():
+def test_a_scene_in_small_units_is_told_of_where_the_near_plane_keeps_an_orbit_away_from_it(monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 800)
     base = wrap_model(shrunk(0.02))
     where = r"the scene is 0.0\d+ units wide, and no view shows it larger than \S+ px: renderers of 3DGS draw nothing nearer than 0.2 units; "
     where += "scale the scene up, with its cameras if it has any"  # here it has none

@@ -57,7 +57,6 @@ def test_a_file_that_is_written_takes_no_memory_while_the_next_is_made(run, mode
     assert left == [[], [None]]
 
 
-@pytest.mark.usefixtures("small_orbits")
 def test_adapt_writes_beside_the_checkpoint_unless_told_otherwise(run, tmp_path):
     base = tiny.ply(tmp_path / "base.ply")
     code, out, _ = run("adapt", base, "--scale", "4", *NO_STEP, "--json")
@@ -100,7 +99,6 @@ def test_the_same_scale_twice_is_one_scale(run, model_folder, tmp_path):
     assert code == 0 and out.count("x4:") == 1
 
 
-@pytest.mark.usefixtures("small_orbits")
 def test_an_output_that_exists_needs_overwrite_and_is_refused_before_any_work(run, tmp_path, monkeypatch):
     base = tiny.ply(tmp_path / "base.ply")
     (tmp_path / "base_x4.ply").write_text("precious")

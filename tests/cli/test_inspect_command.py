@@ -64,7 +64,6 @@ def test_inspect_doubts_a_file_of_another_convention(run, tmp_path):
     assert "\nverdict:      doubtful: read health before you adapt it\n" in run("inspect", tmp_path / "b.ply")[1]
 
 
-@pytest.mark.usefixtures("small_orbits")
 def test_splats_that_are_left_out_are_told_of(run, tmp_path):
     """Whatever the command, and in the log: what is drawn is not all of the file."""
     columns = read_ply(tiny.ply(tmp_path / "a.ply", count=20)).columns
@@ -87,7 +86,6 @@ def test_an_output_that_names_a_file_becomes_no_folder(run, tmp_path, option):
     assert not [*tmp_path.glob("b*")]
 
 
-@pytest.mark.usefixtures("small_orbits")
 def test_a_folder_of_a_base_and_its_adaptations_is_the_base(run, tmp_path):
     ply = tiny.ply(tmp_path / "a.ply")
     assert run("adapt", ply, "--scale", "1/2", "--recipe", "instant")[0] == 0
@@ -102,7 +100,6 @@ def test_inspect_as_json(run, tmp_path):
     assert isinstance(facts["effects"], list) and isinstance(facts["notes"], list)
 
 
-@pytest.mark.usefixtures("small_orbits")
 def test_cameras_beside_a_lone_file_are_named_but_not_read(run, tmp_path):
     """They may be of another scene."""
     ply, cameras = tiny.ply(tmp_path / "a.ply"), tmp_path / "cameras.json"

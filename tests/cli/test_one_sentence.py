@@ -105,7 +105,6 @@ def test_requests_that_cannot_be_served_end_in_one_sentence(run, model_folder):
     refused(run("adapt", model_folder, "--scale", "4", "--cameras", "nowhere.json"), "nowhere.json: there is no such file")
 
 
-@pytest.mark.usefixtures("small_orbits")
 def test_a_full_disk_ends_in_one_sentence_and_leaves_the_old_file(run, tmp_path, monkeypatch):
     base, output = tiny.ply(tmp_path / "base.ply"), tmp_path / "new.ply"
     output.write_text("precious")
@@ -121,7 +120,7 @@ def test_a_full_disk_ends_in_one_sentence_and_leaves_the_old_file(run, tmp_path,
     assert output.read_text() == "precious" and sorted(path.name for path in tmp_path.iterdir()) == ["base.ply", "new.ply"]
 
 
-@pytest.mark.usefixtures("small_orbits", "brief_ladders")
+@pytest.mark.usefixtures("brief_ladders")
 def test_levels_without_cameras_are_told_of_once(run, tmp_path):
     """Each of several levels is adapted to the orbit."""
     base = tiny.ply(tmp_path / "base.ply")

@@ -66,7 +66,6 @@ def test_render_says_that_no_view_shows_anything(run, tmp_path):
     assert "none of the 2 views shows a splat: the cameras seem to be of another scene" in " ".join(err.split())
 
 
-@pytest.mark.usefixtures("small_orbits")
 def test_render_says_that_its_views_are_generated(run, tmp_path):
     out = run("render", tiny.ply(tmp_path / "a.ply"), "--output", tmp_path / "out", "--up", "z")[1]
     assert out.endswith("\nseen from a generated orbit, from above the horizon, with z up; --cameras gives the scene's own cameras\n")

@@ -242,7 +242,7 @@ def rounding(tool):
     tiny.model(seed=5).save(tool / "answer.ply", provenance={}, overwrite=True)
 
 
-@pytest.mark.usefixtures("small_orbits", "rounding")
+@pytest.mark.usefixtures("rounding")
 def test_the_db_of_a_file_are_of_what_its_format_keeps(tmp_path, capsys):
     words = ["--scale", "1/4", "--steps", "0", "--viewer", "classic"]
     source = tiny.ply(tmp_path / "scan.ply")
@@ -263,7 +263,7 @@ def test_the_db_of_a_file_are_of_what_its_format_keeps(tmp_path, capsys):
     assert report["written"] < base and worse in said.err and any(worse in note for note in report["notes"])
 
 
-@pytest.mark.usefixtures("small_orbits", "rounding")
+@pytest.mark.usefixtures("rounding")
 def test_the_db_in_each_of_several_viewers_are_of_what_a_format_keeps(tmp_path):
     adapted = wrap_model(tiny.ply(tmp_path / "scan.ply")).adapt(1 / 4, steps=0, merge_to=1.0, viewer="portable")
     exact, files = adapted.report.viewers, [adapted.save(tmp_path / f"a.{suffix}") for suffix in ("ply", "spz")]
@@ -271,7 +271,6 @@ def test_the_db_in_each_of_several_viewers_are_of_what_a_format_keeps(tmp_path):
     assert ply == exact and spz.keys() == exact.keys() and spz["classic"] < exact["classic"] - 1
 
 
-@pytest.mark.usefixtures("small_orbits")
 def test_a_ply_is_not_measured_again(tmp_path, capsys):
     words = ["--scale", "1/4", "--steps", "0"]
     assert main(["adapt", str(tiny.ply(tmp_path / "scan.ply")), *words, "--output", str(tmp_path / "out.ply")]) == 0

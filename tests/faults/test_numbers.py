@@ -57,7 +57,8 @@ def test_scales_that_nothing_can_be_drawn_at(model, scale):
 
 
 @pytest.mark.parametrize("scale", [limits.MIN_SCALE, 1e-3, 100, limits.MAX_SCALE])
-def test_what_is_saved_at_the_ends_of_the_range_is_read_again(model, tmp_path, scale):
+def test_what_is_saved_at_the_ends_of_the_range_is_read_again(tmp_path, scale):
+    model = wrap_model(tiny.model(10), cameras=tiny.cameras(2, width=8, height=6), backend="reference")
     saved = model.adapt(scale, recipe="instant").save(tmp_path / "a.ply")
     assert len(load_model(saved)) == 10 and not any("dropped" in note for note in load_model(saved).notes)
 

@@ -43,7 +43,6 @@ def test_a_file_is_finished_by_the_views_for_validation_that_were_asked_for(tmp_
         assert finished(made) is not None and finished(other) is None
 
 
-@pytest.mark.usefixtures("small_orbits")
 @pytest.mark.parametrize(("scale", "cameras", "fits", "other"), [
     (1 / 2, True, "pil-bicubic", "area"),
     (1 / 16, True, "area", "pil-bicubic"),  # 2 px
@@ -98,7 +97,6 @@ def test_another_network_of_that_name_is_not_finished(tmp_path):
     assert finished(job) is None
 
 
-@pytest.mark.usefixtures("small_orbits")
 def test_another_vertical_is_not_finished(tmp_path):
     job = job_of(tmp_path)
     job = replace(job, base=replace(job.base, cameras=None, up="z"))

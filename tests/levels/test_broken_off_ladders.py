@@ -30,7 +30,6 @@ def test_levels_of_other_cameras_are_not_gone_on_with(tmp_path, change):
         make_levels(base, request(coarsest=0.9), tmp_path / "state")
 
 
-@pytest.mark.usefixtures("small_orbits")
 def test_levels_of_another_vertical_are_not_gone_on_with(tmp_path):
     base, other = (wrap_model(tiny.model(), up=up) for up in ("z", None))
     asked = request(coarsest=0.9, steps=0, extra_views=2)

@@ -116,7 +116,7 @@ def test_the_paper_recipe_neither_clones_nor_splits_anchors(folder):
 
 def test_without_cameras_an_orbit_goes_around_the_anchors(folder):
     adapted = wrap_model(load_model(folder)).adapt(1 / 16, steps=1, extra_views=2)
-    assert adapted.report.views == "2 views of a generated orbit at 800 px (the checkpoint came without cameras)"
+    assert adapted.report.views == "2 views of a generated orbit at 24 px (the checkpoint came without cameras)"
 
 
 def test_inspecting_examines_what_a_view_shows(folder, capsys):

@@ -122,7 +122,6 @@ def test_no_tile_grows_beyond_what_the_settings_allow(job):
     assert 80 < adapt_in_tiles(replace(job, recipe="paper", settings=settings), 2).report.gaussians_after <= 96
 
 
-@pytest.mark.usefixtures("small_orbits")
 def test_tiles_without_cameras_have_the_filter_that_fits_generated_views(job):
     job = replace(job, base=Base(tiny.ply(job.target.with_name("bare.ply"), count=80)), scale=1 / 16)  # of 24 px
     assert adapt_in_tiles(replace(job, settings=job.settings | {"steps": 0}), 2).report.settings.resize == "area"

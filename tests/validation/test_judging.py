@@ -81,8 +81,7 @@ def test_a_start_is_chosen_by_more_views_than_a_few_steps_are(steps, views):
     assert len(held_back(tiny.cameras(MANY), "train", steps=steps, validation_views=2)[1]) == 2
 
 
-def test_without_cameras_validation_has_an_orbit_of_its_own(monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 24)
+def test_without_cameras_validation_has_an_orbit_of_its_own():
     left, judged = held_back([], "jittered")
     assert (len(left), len(judged)) == (8, 16) and not poses(left) & poses(judged)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -35,14 +35,14 @@ class Activation:
         """Return the splats that the camera sees."""
         if self._splats is None:
             return self._model.gaussians(camera)
-        leaves = {name: tensor.detach().requires_grad_(tensor.requires_grad) for name, tensor in _tensors(self._splats).items()}
+        leaves = {name: tensor.detach().requires_grad_(tensor.requires_grad) for name, tensor in self._splats.tensors().items()}
         return replace(self._splats, **leaves)
 
     def accumulate(self, splats: Gaussians) -> None:
         """Take the gradients of the `splats` that one view was rendered from, and add them up."""
         if self._splats is None:
             return
-        for name, leaf in _tensors(splats).items():
+        for name, leaf in splats.tensors().items():
             if leaf.grad is not None:
                 self._gradients[name] = self._gradients[name].add_(leaf.grad) if name in self._gradients else leaf.grad
                 leaf.grad = None  # makes room for the next view's
@@ -60,7 +60,7 @@ class Activation:
         """Pass the accumulated gradients on to the parameters, after the backward pass of the last view."""
         if self._splats is None:
             return
-        splats = _tensors(self._splats)
+        splats = self._splats.tensors()
         gradients, self._splats, self._gradients = self._gradients, None, {}
         if gradients:
             end = _WithGradients.apply(list(gradients.values()), *(splats[name] for name in gradients))  # type: ignore[no-untyped-call]  # torch's
@@ -81,8 +81,3 @@ class _WithGradients(torch.autograd.Function):
     def backward(ctx: Any, _: Tensor) -> tuple[Tensor | None, ...]:
         gradients, ctx.gradients = ctx.gradients, None  # the colors' can be freed as soon as they are split
         return None, *gradients
-
-
-def _tensors(gaussians: Gaussians) -> dict[str, Tensor]:
-    values = {field.name: getattr(gaussians, field.name) for field in fields(gaussians)}
-    return {name: tensor for name, tensor in values.items() if tensor is not None}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from typing import NamedTuple
@@ -63,9 +63,8 @@ def odd_row(row: dict[str, Tensor], screen_filter: str = "classic") -> HardCase:
     """A crowd in which the values `row` make one splat hard; the others show whether it harms them."""
     gaussians = crowd()
     row = {**_row(means=(0.1, 0.05, 2.5)), **row}
-    tensors = {f.name: getattr(gaussians, f.name) for f in fields(gaussians)}
-    tensors = {name: tensor if name not in row else tensor.index_put((torch.tensor(5),), row[name]) for name, tensor in tensors.items()}
-    return HardCase(Gaussians(**tensors), view(), Effects(1, screen_filter, USUAL_EPS2D[screen_filter], near_plane=NEAR))
+    tensors = {name: getattr(gaussians, name).index_put((torch.tensor(5),), value) for name, value in row.items()}
+    return HardCase(replace(gaussians, **tensors), view(), Effects(1, screen_filter, USUAL_EPS2D[screen_filter], near_plane=NEAR))
 
 
 def seen_by(camera: Camera, screen_filter: str = "classic") -> HardCase:

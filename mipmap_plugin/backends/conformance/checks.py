@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -103,8 +103,7 @@ def check_views(backend: Backend, build: Builder, *, dtype: torch.dtype = torch.
     shots = [(case.camera, case.effects), (case.camera.zoomed(0.5), case.effects)]
     answers = []
     for renders in (backend.render_views, lambda splats, shots: [backend.render(splats, *shot) for shot in shots]):  # type: ignore[attr-defined]
-        leaves = {f.name: getattr(splats, f.name) for f in fields(Gaussians)}
-        leaves = {name: leaf.detach().clone().requires_grad_() for name, leaf in leaves.items() if leaf is not None}
+        leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in splats.tensors().items()}
         drawn = renders(Gaussians(**leaves), shots)
         images = torch.cat([rendered.image.flatten(0, 1) for rendered in drawn])
         alphas = torch.cat([rendered.alpha.flatten() for rendered in drawn])
@@ -134,8 +133,9 @@ def _raw_answer(backend: Backend, raw: Mapping[str, Tensor], case: HardCase) -> 
     return Answer(_plain(rendered.image), _plain(rendered.alpha)[..., None], dict(zip(leaves, map(_plain, grads), strict=True)))
 
 
-def _step_answer(backend: Any, raw: Mapping[str, Tensor], case: HardCase, beta: float = 0.5) -> Answer:
+def _step_answer(backend: Any, raw: Mapping[str, Tensor], case: HardCase) -> Answer:
     """The gradients that a first step of rate 0 shows: the first moments over 1 - beta1."""
+    beta = 0.5
     own, first, second = ({name: make(tensor) for name, tensor in raw.items()} for make in (torch.clone, torch.zeros_like, torch.zeros_like))
     stepper = backend.stepper(own)
     rendered = stepper.render(0, case.camera, case.effects)
@@ -151,8 +151,7 @@ def _squares(rendered: Rendered) -> Tensor:
 
 def draw(backend: Backend, case: HardCase, *, differentiate: bool = True) -> Answer:
     """Render `case`, and differentiate the sum of the image under fixed random weights of both signs."""
-    leaves = {f.name: getattr(case.gaussians, f.name) for f in fields(Gaussians)}
-    leaves = {name: leaf.detach().clone().requires_grad_(differentiate) for name, leaf in leaves.items() if leaf is not None}
+    leaves = {name: tensor.detach().clone().requires_grad_(differentiate) for name, tensor in case.gaussians.tensors().items()}
     rendered = backend.render(Gaussians(**leaves), case.camera, case.effects)
     _check_rendered(rendered, case)
     image, alpha = rendered.image, rendered.alpha[..., None]
