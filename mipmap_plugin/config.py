@@ -96,7 +96,10 @@ class AdaptConfig(BaseModel):
 
     closed_form: bool = Field(default=True, description="Start from the closed form instead of from the base.")
     crispness: float = Field(
-        default=0.0, ge=0, le=1, description="Zoom-in: from 0 (highest PSNR) to 1 (splats as small as the base's, but more opaque)."
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Zoom-in: from 0 (highest PSNR) to 1 (splats as small as the base's, but more opaque); below x2, without steps, at least.",
     )
     merge_to: float = Field(default=1.0, gt=0, le=1, description="Fraction of the splats to keep when similar splats that share pixels are merged.")
     merging_costs: float = Field(

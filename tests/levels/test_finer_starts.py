@@ -68,7 +68,9 @@ def test_what_is_merged_too_coarsely_leaves_the_choice_to_plain_merging(monkeypa
         def parameters(self):
             return {"means": torch.zeros(100, 3)}
 
-    config = SimpleNamespace(most_splats=None, closed_form=True, merge_to=0.1, merging_costs=9.0, returns="best", time_budget_s=None, steps=steps)
+    config = SimpleNamespace(
+        most_splats=None, closed_form=True, crispness=0.0, merge_to=0.1, merging_costs=9.0, returns="best", time_budget_s=None, steps=steps
+    )
     problem = SimpleNamespace(
         base=lambda: Base(["finer"]), coarse_base=lambda: Base(["base"]), config=config, quality=quality, may_lose=9.0, name="the finer level",
         views=[], scale=0.5, phase=lambda _: nullcontext(), base_effects=Effects(0), target=Effects(0), has_blend_weights=False,
