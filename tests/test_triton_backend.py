@@ -184,6 +184,9 @@ def test_what_is_missing_is_reported(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr("mipmap_plugin.backends.triton.unbuilt", lambda: [])
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (6, 1))
+    assert TritonBackend().lacking(USUAL) == ["it needs a GPU of compute capability 7.0 or more; this one has 6.1"]
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (7, 5))
     assert TritonBackend().lacking(USUAL) == []
     assert TritonBackend().lacking(replace(USUAL, screen_filter="window")) == ["it has the screen filters antialiased, classic, mip, not window"]
     monkeypatch.setattr("mipmap_plugin.backends.triton.version", lambda name: "3.2.0")
@@ -202,6 +205,7 @@ def test_without_a_compiler_for_its_launcher_another_backend_is_taken(monkeypatc
     monkeypatch.setitem(sys.modules, "triton.runtime", SimpleNamespace(driver=Driver()))
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (9, 0))
     unbuilt.cache_clear()
     [reason] = TritonBackend().lacking(USUAL)
     unbuilt.cache_clear()

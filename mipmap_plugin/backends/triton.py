@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from mipmap_plugin.backends.triton_kernels.views import Shot
 
 OLDEST = (3, 3)  # versions before it compile no tuples
+OLDEST_GPU = (7, 0)  # compute capability: relaxed atomics, by which gradients are summed, begin with it
 NO_TRITON = "it needs triton, which comes with torch's CUDA wheels: pip install triton"
 
 
@@ -148,7 +149,12 @@ def missing() -> list[str]:
             return [f"it needs triton {'.'.join(map(str, OLDEST))} or newer, which comes with torch 2.7; {installed} is installed"]
     if interpreted():
         return []
-    return unbuilt() if torch.cuda.is_available() else [NO_CUDA]
+    if not torch.cuda.is_available():
+        return [NO_CUDA]
+    major, minor = torch.cuda.get_device_capability()
+    if (major, minor) < OLDEST_GPU:
+        return [f"it needs a GPU of compute capability {'.'.join(map(str, OLDEST_GPU))} or more; this one has {major}.{minor}"]
+    return unbuilt()
 
 
 @cache
