@@ -131,7 +131,7 @@ def worse_views(views: Sequence[Camera], before: Sequence[float], after: Sequenc
 
 def _focal(view: Camera) -> float:
     """The focal length of both axes, px, of the lens itself: a view of a band lies at a zoom of its own."""
-    return math.sqrt(view.fx * view.fy) / view.zoom
+    return math.sqrt(view.fx * view.fy) * view.base_zoom / view.zoom
 
 
 def too_near(views: Sequence[Camera], means: Tensor, near: float) -> str:

@@ -31,7 +31,7 @@ def views_for_screen(base: Wrapped, screen: Camera, look_at: Tensor, scale: floa
     given = base.cameras or base.viewpoints.best(evenly(base.views(), OWN))
     train = [view for view in given if view.split == "train"] or given
     own = [middle(view, scale) for view in evenly(train, OWN)]
-    return [replace(view, name=f"screen_{number}", zoom=1.0, index=own[0].index) for number, view in enumerate(near)] + own
+    return [replace(view, name=f"screen_{number}", base_zoom=view.zoom, index=own[0].index) for number, view in enumerate(near)] + own
 
 
 def turned(screen: Camera, look_at: Tensor, number: int) -> Camera:

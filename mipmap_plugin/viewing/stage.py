@@ -62,10 +62,14 @@ class Stage:
         self.sources[name] = source
         return name
 
+    def camera(self, look: Look, screen: Camera) -> Camera:
+        """The camera of the picture that a screen shows, with the zoom of its lens."""
+        return self.sampling.with_lens(smaller(replace(screen, time=look.time), 1 / look.pixel))
+
     @torch.no_grad()
     def draw(self, look: Look, screen: Camera, coarse: float = 1.0) -> Picture:
         """Draw what a screen shows; `coarse`: the fraction of its width and height that is drawn. Raises SettingsError, BackendUnavailable."""
-        camera = smaller(replace(screen, time=look.time), 1 / look.pixel)
+        camera = self.camera(look, screen)
         zoom = self.sampling.of(camera).zoom
         drawn = smaller(camera, coarse)
         request = Request(drawn, zoom, look.viewer, drawn.height / camera.height if coarse < 1 else 1.0)
