@@ -50,8 +50,9 @@ class Camera:
         name: Of the view, as in messages and files: that of its photograph, for example.
         split: Whether the base was trained on it; views of "test" are for judging.
         time: 0..1, for moving scenes; None: the scene does not move.
-        zoom: Sampling rate ÷ that of training; models with levels of detail choose their level by it.
+        zoom: Focal length in px ÷ that of training, wherever the camera is; models with levels of detail choose their level by it.
         index: Number of the view in training, for models with one appearance embedding per view.
+        base_zoom: `zoom` of the same view at the base's scale, which is not 1 through another lens than that of training.
     """
 
     width: int
@@ -66,6 +67,7 @@ class Camera:
     time: float | None = None
     zoom: float = 1.0
     index: int | None = None
+    base_zoom: float = 1.0
 
     def __post_init__(self) -> None:
         self._check_view()
@@ -105,11 +107,11 @@ class Camera:
         object.__setattr__(self, "name", str(self.name))
         if self.split not in ("train", "test"):
             raise SettingsError(f"camera {self.name!r}: split must be 'train' or 'test', got {self.split!r}")
-        kinds: dict[str, Callable[[Any], Any]] = {"time": float, "zoom": float, "index": index}
+        kinds: dict[str, Callable[[Any], Any]] = {"time": float, "zoom": float, "base_zoom": float, "index": index}
         for name, kind in kinds.items():
-            if getattr(self, name) is not None or name == "zoom":
+            if getattr(self, name) is not None or name.endswith("zoom"):
                 object.__setattr__(self, name, self._number(name, kind))
-        if not math.isfinite(self.time or 0) or not 0 < self.zoom < math.inf:
+        if not math.isfinite(self.time or 0) or not all(0 < zoom < math.inf for zoom in (self.zoom, self.base_zoom)):
             raise SettingsError(f"camera {self.name!r}: time must be finite, and zoom a number above 0, got {self.time} and {self.zoom}")
 
     def _check_intrinsics(self) -> None:
@@ -283,9 +285,9 @@ def checked(cameras: Any, *, some: bool = False) -> list[Camera]:
 def of_base_scale(cameras: Any, *, some: bool = False) -> list[Camera]:
     """The cameras that a base is given. Raises as `checked`.
 
-    Those that an adapted model is seen by are `zoomed`: if it is a base itself, they are of the base scale, whose zoom is 1.
+    Those that an adapted model is seen by are `zoomed`: if it is a base itself, they are of the base scale.
     """
-    return [camera if camera.zoom == 1 else replace(camera, zoom=1.0) for camera in checked(cameras, some=some)]
+    return [camera if camera.zoom == camera.base_zoom else replace(camera, zoom=camera.base_zoom) for camera in checked(cameras, some=some)]
 
 
 def digest_of(cameras: Sequence[Camera]) -> str:

@@ -19,7 +19,7 @@ from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.streamed_sog import read_chunks
 from mipmap_plugin.levels.exported import readable
 from mipmap_plugin.levels.manifest import MANIFEST
-from mipmap_plugin.levels.streamed import EXTENT, distances, viewer_settings, write_streamed
+from mipmap_plugin.levels.streamed import EXTENT, Approach, distances, viewer_settings, write_streamed
 from mipmap_plugin.levels.tiles import bounding_box, tileset, write_tile, write_tiles
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.vanilla import VanillaModel
@@ -115,7 +115,8 @@ def test_streamed_sog_is_written_with_its_levels_and_settings(ladder, tool):
     assert words[-9:] == [word for number in range(3) for word in (str(ladder / f"level_{number}.ply"), "--tag-lod", str(number))]
     assert words[words.index("--lod-chunk-extent") + 1] == str(round(EXTENT * distances(LADDER, 1000)[0]))
     assert read_chunks(made) == CHUNKS
-    assert json.loads((made.parent / "playcanvas.json").read_text()) == viewer_settings(LADDER, CHUNKS, 1000)
+    approach = Approach.to(tiny.gaussians().means.median(0).values, CHUNKS)
+    assert json.loads((made.parent / "playcanvas.json").read_text()) == viewer_settings(LADDER, approach, 1000)
     with pytest.raises(OutputExists):
         write_streamed(ladder)
 

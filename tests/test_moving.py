@@ -10,6 +10,7 @@ import torch
 
 from mipmap_plugin.adaptation.views import with_times
 from mipmap_plugin.cli import main
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models import load_model
 from mipmap_plugin.scenes import jittered
 from mipmap_plugin.wrap import wrap_model
@@ -100,3 +101,22 @@ def test_render_refuses_times_of_no_scene(tmp_path, capsys):
     for folder, time, sentence in cases:
         assert main(["render", str(folder), "--output", str(tmp_path / "out"), "--time", time]) == 2
         assert sentence in capsys.readouterr().err
+
+
+def carried(folder, far):
+    """What adapting at x1/16 finds without cameras where the field carries all splats that far along x, in world units."""
+    state = moving.deform_state()
+    state["gaussian_warp.bias"] = state["gaussian_warp.bias"] + torch.tensor([far, 0.0, 0.0])
+    moving.write_deformable(folder, state)
+    (folder / "cameras.json").unlink()
+    wrapped = wrap_model(folder)
+    return wrapped, wrapped.adapt(1 / 16, steps=2, extra_views=6, validation_views=4).report
+
+
+def test_splats_that_a_field_carries_far_away_are_adapted_as_those_that_stay(tmp_path):
+    (_, stays), (wrapped, goes) = carried(tmp_path / "stays", 0.0), carried(tmp_path / "goes", 30.0)
+    assert wrapped.viewpoints.orbit.center[0] == pytest.approx(30, abs=0.5)
+    gains = [report.psnr_after() - report.psnr_before() for report in (stays, goes)]
+    assert gains[0] > 3 and gains[1] == pytest.approx(gains[0], abs=0.01)
+    with pytest.raises(SettingsError, match="the cameras seem to be in other units"):
+        wrapped.adapt(1 / 16, cameras=tiny.cameras(4), views="given", steps=2)

@@ -4,11 +4,14 @@ import math
 
 import pytest
 import tiny
+import torch
 from two_levels import CHUNKS, LADDER
 
 from mipmap_plugin.formats.streamed_sog import Chunk
-from mipmap_plugin.levels.streamed import distances, nearer, progression, viewer_settings
+from mipmap_plugin.levels.streamed import Approach, distances, progression, viewer_settings
 from mipmap_plugin.levels.tiles import SCREEN_ERROR, bounding_box, errors, tileset
+
+APPROACH = Approach.to(torch.tensor([2.0, 0.5, 0.5]), CHUNKS)
 
 
 def test_a_switch_lies_at_the_distance_where_a_base_pixel_has_its_zoom():
@@ -30,30 +33,33 @@ def test_distances_too_close_for_playcanvas_are_spread_around_their_middle():
     assert progression([0.01], 2.0) == pytest.approx((0.1, 2))
 
 
-def test_chunks_are_taken_to_be_closer_than_their_splats():
-    """By half of the sum of half extents; of a box larger than most, three quarters of what it has more are left out."""
-    assert nearer(CHUNKS) == pytest.approx((1 + 0.5 + 0.5) / 2)
-    large = Chunk((0, 0, 0), (9, 9, 9), (20, 0, 0))
-    assert nearer([*CHUNKS, large]) == pytest.approx((40 * 1 + 20 * (1 + 3.5 / 4 + 2 * (0.5 + 4 / 4)) / 2) / 60)
+def test_of_a_chunk_that_one_splat_far_away_makes_long_the_nearer_end_counts():
+    """Its middle is 500 units away, but hardly any direction brings that nearer to a camera than its splats."""
+    boxes = [Chunk((-1, -1, -1), (0, 1, 1), (20, 0, 0)), Chunk((0, -1, -1), (1, 1, 1), (10, 0, 0)), Chunk((0, -1, -1), (1000, 1, 1), (20, 0, 0))]
+    usual, long = (Approach.to(torch.zeros(3), some) for some in (boxes[:2], boxes))
+    assert usual.chunk_distance(10) == pytest.approx(10 - 1.25, abs=0.25)
+    assert 10 - 1.5 < long.chunk_distance(10) < 10
+    assert long.camera_distance(long.chunk_distance(10)) == pytest.approx(10, rel=1e-3)
 
 
 def test_a_page_is_told_to_keep_the_distances():
-    settings, wanted = viewer_settings(LADDER, CHUNKS, 1000), distances(LADDER, 1000)
-    assert settings["lodBaseDistance"] == pytest.approx(wanted[0] - 1) and settings["zooms"] == pytest.approx([0.7, 0.35])
-    assert settings["lodMultiplier"] == pytest.approx((wanted[1] - 1) / (wanted[0] - 1))
+    settings, wanted = viewer_settings(LADDER, APPROACH, 1000), distances(LADDER, 1000)
+    near = [APPROACH.chunk_distance(distance) for distance in wanted]
+    assert settings["lodBaseDistance"] == pytest.approx(near[0]) and settings["zooms"] == pytest.approx([0.7, 0.35], rel=1e-3)
+    assert wanted[0] - 2 < near[0] < wanted[0] - 0.5 and settings["lodMultiplier"] == pytest.approx(near[1] / near[0])
     assert settings["splatBudgetMode"] == "limit" and settings["splatBudget"] == 1_000_000
     assert settings["lodUpdateDistance"] < 0.05 * settings["lodBaseDistance"]
 
 
 def test_levels_by_distance_are_shown_at_the_distances_that_they_were_made_for():
     made = LADDER | {"by": "distance", "lodBaseDistance": 3.0, "lodMultiplier": 1.7, "canvas": 500, "chunk_extent": 4}
-    settings = viewer_settings(made, CHUNKS, 1000)
+    settings = viewer_settings(made, APPROACH, 1000)
     assert (settings["lodBaseDistance"], settings["lodMultiplier"]) == (6.0, 1.7)
 
 
 def test_what_playcanvas_takes_for_levels_by_distance_of_a_scene_in_small_units_is_what_is_written():
     made = LADDER | {"by": "distance", "lodBaseDistance": 0.05, "lodMultiplier": 1.19, "canvas": 1000}
-    settings = viewer_settings(made | {"base_pixel": 0.01 * 0.05 / distances(LADDER, 1000)[0]}, CHUNKS, 1000)
+    settings = viewer_settings(made | {"base_pixel": 0.01 * 0.05 / distances(LADDER, 1000)[0]}, APPROACH, 1000)
     assert (settings["lodBaseDistance"], settings["lodMultiplier"]) == (0.1, 1.2)
     assert settings["zooms"][0] < 0.7  # and not where they were made for
 

@@ -16,7 +16,7 @@ from mipmap_plugin.adaptation.parallel import in_batches
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import check_image
-from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.models.base import SplatModel, places
 from mipmap_plugin.models.contract import row_opacities
 from mipmap_plugin.models.health import units
 from mipmap_plugin.progress import announced
@@ -75,7 +75,7 @@ def refuse_blind(views: Sequence[Camera], model: SplatModel, near: float, image_
 
     `near`: the near plane, in world units; `image_of`: a view's image [h, w, 3]; `scale`: the one adapted to, since a zoom-in makes specks large.
     """
-    some, means = evenly(views, LOOKED_AT), model.parameters()["means"]
+    some, means = evenly(views, LOOKED_AT), places(model, views[0])
     if not showing(some, means, near):  # a few of many cameras may see what is left of a scene that was cut down
         some = evenly(showing(views, means, near), LOOKED_AT) or some
     if any(_draws(view, model, near) for view in some):
@@ -93,7 +93,7 @@ def refuse_blind(views: Sequence[Camera], model: SplatModel, near: float, image_
 
 def _draws(view: Camera, model: SplatModel, near: float) -> bool:
     """Whether a row of the parameters that is opaque enough to be drawn lies in the view's picture, farther than the near plane."""
-    inside = view.in_picture(view.to_camera(model.parameters()["means"].detach()), near)
+    inside = view.in_picture(view.to_camera(places(model, view)), near)
     return bool(inside.any()) and bool((row_opacities(model, [view])[inside] >= MIN_ALPHA).any())
 
 
@@ -131,7 +131,7 @@ def worse_views(views: Sequence[Camera], before: Sequence[float], after: Sequenc
 
 def _focal(view: Camera) -> float:
     """The focal length of both axes, px, of the lens itself: a view of a band lies at a zoom of its own."""
-    return math.sqrt(view.fx * view.fy) / view.zoom
+    return math.sqrt(view.fx * view.fy) * view.base_zoom / view.zoom
 
 
 def too_near(views: Sequence[Camera], means: Tensor, near: float) -> str:
@@ -184,5 +184,5 @@ def remarks(views: Sequence[Camera], model: SplatModel, near: float, *, orbit: b
     """What is wrong with a scene in views that show something, in sentences. `near`: the near plane, in world units; `orbit`: they were generated."""
     least = LEAST_SHARE * min(views[0].size)
     least = least if orbit else min(LEAST_PIXELS, least)
-    found = too_near(views, model.parameters()["means"], near), too_small(views, model, near, least)
+    found = too_near(views, places(model, views[0]), near), too_small(views, model, near, least)
     return [sentence for sentence in found if sentence]

@@ -17,7 +17,7 @@ from mipmap_plugin.camera import ONE_PIXEL, Camera, evenly
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.adapted_scale import adapted_orbit
-from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.models.base import SplatModel, places
 from mipmap_plugin.process.threads import side_by_side
 from mipmap_plugin.scenes.orbits import Orbit, sharp_size, sizes
 from mipmap_plugin.splatting.harmonics import C0
@@ -31,6 +31,9 @@ LOOK = 64
 
 # At most so many times as many views are tried as are wanted. Of a kitchen that was photographed from one side a quarter are clear.
 ROUNDS = 4
+
+# Moments of a moving scene, whose splats at all of them an orbit goes around.
+MOMENTS = (0.0, 0.5, 1.0)
 
 # If a time budget allows to look at fewer views than this, any are taken.
 LEAST_LOOKS = 16
@@ -124,7 +127,13 @@ def orbit_of(model: SplatModel, up: tuple[float, float, float] | None, means: Te
         def size() -> float:
             return sharp_size(model.gaussians(ONE_PIXEL)) if model.traits.same_for_all_views else math.inf
 
-        orbit = Orbit.around(model.parameters()["means"] if means is None else means, sharp=size)
+        orbit = Orbit.around(everywhere(model) if means is None else means, sharp=size)
     else:
         orbit = Orbit(**recorded)
     return orbit if up is None else replace(orbit, up=up, said=True)
+
+
+def everywhere(model: SplatModel) -> Tensor:
+    """Where the rows of a model's parameters are, [N, 3]; of one that moves at several moments, [M, 3]."""
+    views = [replace(ONE_PIXEL, time=time) for time in MOMENTS] if model.traits.moves else [ONE_PIXEL]
+    return torch.cat([places(model, view) for view in views])

@@ -5,7 +5,8 @@ to `lodBaseDistance`, level k up to `lodBaseDistance · lodMultiplier^k`. On a c
 away is seen with (H / 2) / (d · tan 22.5°) px per world unit. A base pixel of size p, seen at the zoom z, has z / p.
 
 The distance of a chunk is that to the nearest point of its box, of which `lodDistanceShrink` has taken most of what is larger than in half of
-the chunks. Seen from afar, from any direction alike, the nearest point is closer than the middle by half of the sum of the box's half extents.
+the chunks. It is closer than the splats, and how much depends on the boxes: a few splats far away make some boxes long. So it is measured, from
+cameras that look at the scene from all around.
 """
 
 from __future__ import annotations
@@ -13,12 +14,14 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from mipmap_plugin.errors import TEMPORARY, SettingsError
 from mipmap_plugin.formats.atomic import new_folder, write_json
@@ -27,6 +30,8 @@ from mipmap_plugin.formats.streamed_sog import Chunk, read_chunks, write_streame
 from mipmap_plugin.levels.distance.chunks import shrunk
 from mipmap_plugin.levels.exported import readable
 from mipmap_plugin.levels.manifest import CANVAS, read_manifest
+from mipmap_plugin.models import load_model
+from mipmap_plugin.scenes.orbits import GOLDEN
 
 STREAMED, SETTINGS = "streamed", "playcanvas.json"
 
@@ -34,6 +39,12 @@ SINGLE_LEVEL = "this ladder has a single level, which needs no streaming"
 
 # The largest extent of a chunk, as a part of the distance of the first switch: its near and its far end are then seen at nearly one zoom.
 EXTENT = 1 / 4
+
+# Directions from which chunks are looked at, unit vectors [D, 3] spread evenly; and the steps that find a distance to a millionth.
+HEIGHTS = 1 - (2 * torch.arange(64, dtype=torch.float64, device="cpu") + 1) / 64
+TURNS = 2 * math.pi * GOLDEN * torch.arange(64, dtype=torch.float64, device="cpu")
+DIRECTIONS = torch.stack([TURNS.cos() * (1 - HEIGHTS**2).sqrt(), TURNS.sin() * (1 - HEIGHTS**2).sqrt(), HEIGHTS], dim=1)
+HALVINGS = 20
 
 # The splats that PlayCanvas shows at most.
 BUDGET = 1_000_000
@@ -52,11 +63,40 @@ def distances(manifest: dict[str, Any], canvas: int = CANVAS) -> list[float]:
     return [canvas / 2 * manifest["base_pixel"] / (math.tan(math.pi / 8) * switch["zoom"]) for switch in manifest["switches"]]
 
 
-def nearer(chunks: Sequence[Chunk]) -> float:
-    """How much closer than its splats a chunk is taken to be, in world units: the mean over the finest level's splats."""
-    low, high = (torch.tensor([getattr(chunk, end) for chunk in chunks], dtype=torch.float64) for end in ("low", "high"))
-    splats = torch.tensor([chunk.splats[0] for chunk in chunks], dtype=torch.float64)
-    return float(splats @ shrunk((high - low) / 2).sum(1) / 2 / splats.sum().clamp_min(1))
+@dataclass(frozen=True, eq=False)
+class Approach:
+    """How far away the chunks of a scene are for PlayCanvas when a camera looks at the scene's middle, from any direction."""
+
+    middle: Tensor  # [3] world units
+    low: Tensor  # [C, 3], of the boxes that distances are measured to
+    high: Tensor  # [C, 3]
+    splats: Tensor  # [C], of the finest level
+
+    @classmethod
+    def to(cls, middle: Tensor, chunks: Sequence[Chunk]) -> Approach:
+        """To the `middle` [3] of the finest level's splats, world units."""
+        low, high = (torch.tensor([getattr(chunk, end) for chunk in chunks], dtype=torch.float64) for end in ("low", "high"))
+        center, half = (low + high) / 2, shrunk((high - low) / 2)
+        splats = torch.tensor([chunk.splats[0] for chunk in chunks], dtype=torch.float64)
+        return cls(middle.double(), center - half, center + half, splats)
+
+    def chunk_distance(self, distance: float) -> float:
+        """The distance of the chunks from a camera so far from the middle, world units: the median over splats and directions."""
+        eyes = self.middle + distance * DIRECTIONS
+        away = torch.maximum(self.low - eyes[:, None], eyes[:, None] - self.high).clamp_min(0).norm(dim=2)  # [D, C]
+        rising, order = away.flatten().sort()
+        reached = self.splats.expand(len(eyes), -1).flatten()[order].cumsum(0)
+        return float(rising[int(torch.searchsorted(reached, reached[-1] / 2))])
+
+    def camera_distance(self, distance: float) -> float:
+        """The distance from the middle at which `chunk_distance` is this."""
+        near, far = 0.0, distance
+        while self.chunk_distance(far) < distance:
+            near, far = far, 2 * far
+        for _ in range(HALVINGS):
+            half = (near + far) / 2
+            near, far = (near, half) if self.chunk_distance(half) >= distance else (half, far)
+        return far
 
 
 def progression(rising: Sequence[float], ratio: float) -> tuple[float, float]:
@@ -72,16 +112,17 @@ def progression(rising: Sequence[float], ratio: float) -> tuple[float, float]:
     return max(math.exp(fmean(logs) - slope * middle), NEAREST), math.exp(slope)
 
 
-def viewer_settings(manifest: dict[str, Any], chunks: Sequence[Chunk], canvas: int = CANVAS) -> dict[str, Any]:
+def viewer_settings(manifest: dict[str, Any], approach: Approach, canvas: int = CANVAS) -> dict[str, Any]:
     """What a page has to set on its PlayCanvas splat component (the first two) and on `scene.gsplat`, and the zooms at which levels then change."""
-    by_distance = manifest.get("by") == "distance"  # such levels are made for distances from chunks, not from splats
-    rising, offset = distances(manifest, canvas), 0.0 if by_distance else nearer(chunks)
-    scales = [level["scale"] for level in manifest["levels"]]
-    base, multiplier = progression([max(distance - offset, distance / 2) for distance in rising], scales[0] / scales[1])
-    if by_distance:
+    rising, scales = distances(manifest, canvas), [level["scale"] for level in manifest["levels"]]
+    if manifest.get("by") == "distance":  # such levels are made for distances from chunks, not from splats
         base = max(manifest["lodBaseDistance"] * canvas / manifest["canvas"], NEAREST)
         multiplier = max(manifest["lodMultiplier"], LEAST_MULTIPLIER)
-    shown = [base * multiplier**number + offset for number in range(len(rising))]
+        shown = [base * multiplier**number for number in range(len(rising))]
+    else:
+        near = [max(approach.chunk_distance(distance), distance / 2) for distance in rising]
+        base, multiplier = progression(near, scales[0] / scales[1])
+        shown = [approach.camera_distance(base * multiplier**number) for number in range(len(rising))]
     return {
         "lodBaseDistance": base,
         "lodMultiplier": multiplier,
@@ -109,5 +150,6 @@ def write_streamed(folder: Path, canvas: int = CANVAS) -> Path:
         extent = manifest.get("chunk_extent", max(1, round(EXTENT * rising[0])))
         files = [level["file"] for level in manifest["levels"]]
         write_streamed_sog([readable(folder / file, Path(copies, file)) for file in files], made, extent)
-        write_json(temporary / SETTINGS, viewer_settings(manifest, read_chunks(made), canvas), overwrite=False)
+        middle = load_model(folder / files[0]).parameters()["means"].detach().median(dim=0).values
+        write_json(temporary / SETTINGS, viewer_settings(manifest, Approach.to(middle, read_chunks(made)), canvas), overwrite=False)
     return folder / STREAMED / LOD_META

@@ -257,6 +257,13 @@ def count_of(model: SplatModel, view: Camera, scale: float = 1.0) -> int:
     return len(model.parameters()["means"]) if model.traits.rows == SPLATS else len(model.gaussians(view.zoomed(scale)))
 
 
+@torch.no_grad()
+def places(model: SplatModel, view: Camera) -> Tensor:
+    """Where the rows of the parameters are at a view's moment, [N, 3] in world units: a field may carry splats far from where they rest."""
+    moved = model.traits.moves and model.traits.rows == SPLATS
+    return (model.gaussians(view).means if moved else model.parameters()["means"]).detach()
+
+
 def tensors_of(model: SplatModel) -> dict[str, Tensor]:
     """All parameters by name, those without rows too."""
     return {**model.parameters(), **model.shared_parameters()}

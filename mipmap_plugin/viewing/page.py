@@ -7,7 +7,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -219,9 +219,9 @@ class Page:
         if event.client is None or self.adapter.progress.running:
             return
         (pose, width, height), look = _view(event.client), self._controls.look()
-        screen = smaller(pose.camera(width, height), 1 / look.pixel)
+        screen = self._stage.camera(look, pose.camera(width, height))
         zoom = self._stage.sampling.of(screen).zoom
-        wish = Wish(replace(screen, time=look.time), pose.look_at, zoom, look.viewer, self._controls.seconds.value, self._controls.recipe.value)
+        wish = Wish(screen, pose.look_at, zoom, look.viewer, self._controls.seconds.value, self._controls.recipe.value)
         try:
             self.adapter.start(wish, self._ended)
         except SettingsError:  # another browser was quicker

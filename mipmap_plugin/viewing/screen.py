@@ -63,6 +63,11 @@ class Sampling:
         self._pixels = pixel_size(self.means, views)  # in the closest view, so that most views sample more coarsely
         typical = torch.tensor([self.of(view).zoom for view in evenly(views, MOST_VIEWS)]).median()
         self._pixels = self._pixels / typical
+        self._focal = float(torch.tensor([math.sqrt(view.fx * view.fy) for view in evenly(views, MOST_VIEWS)]).median())  # px
+
+    def with_lens(self, camera: Camera) -> Camera:
+        """The camera with the `zoom` of its lens: its focal length over a typical one of the training, without the distance."""
+        return replace(camera, zoom=math.sqrt(camera.fx * camera.fy) / self._focal)
 
     def of(self, camera: Camera) -> OnScreen:
         """The zoom of a camera, and the depth of what it shows; the splats are counted among those looked at (`inside` counts all)."""

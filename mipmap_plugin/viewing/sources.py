@@ -30,7 +30,7 @@ MOST_SAMPLES = 4
 class Request:
     """One picture of a source."""
 
-    camera: Camera
+    camera: Camera  # whose own `zoom` is that of its lens (`Sampling.with_lens`)
     zoom: float  # how finely the screen samples the scene, relative to the training
     viewer: str | None = None  # as which viewer draws; None: as in its training
     coarse: float = 1.0  # below 1: the camera has fewer pixels than the screen, by this factor on each axis
@@ -61,8 +61,7 @@ class File:
     def render(self, request: Request) -> Tensor:
         """The picture, [H, W, 3]. Raises SettingsError and BackendUnavailable."""
         effects = coarser(self._model.effects(viewer=request.viewer), request.coarse)
-        camera = replace(request.camera, zoom=request.zoom)
-        return render_model(self._read_by(request.viewer), self._backend(request.viewer), camera, effects).image
+        return render_model(self._read_by(request.viewer), self._backend(request.viewer), request.camera, effects).image
 
     def shown(self, zoom: float) -> str:
         """The name."""
@@ -83,8 +82,8 @@ class Supersampled(File):
         """The picture, [H, W, 3]: the mean of N x N samples, of which none is finer than four per pixel, or than the training's own."""
         n = 1 if request.coarse < 1 else min(MOST_SAMPLES, max(1, math.ceil(1 / request.zoom)))
         camera = request.camera.resized(request.camera.width * n, request.camera.height * n)
-        fine = request.zoom * request.coarse * n
-        image = self._model.render(replace(camera, zoom=request.zoom), fine, "scaled").image
+        camera = replace(camera, zoom=camera.zoom / min(1.0, request.zoom))  # a model with levels of detail shows those of its training
+        image = self._model.render(camera, request.zoom * request.coarse * n, "scaled").image
         return resize(image.clamp(0, 1), request.camera.size, "box")
 
 

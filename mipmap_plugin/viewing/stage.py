@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.curve import Stopwatch, decibel
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.models.base import places
 from mipmap_plugin.viewing.screen import Sampling
 from mipmap_plugin.viewing.sources import Request, Source, Supersampled
 from mipmap_plugin.wrap import Wrapped
@@ -48,8 +49,8 @@ class Stage:
     def __init__(self, base: Wrapped, others: Iterable[Source], reference: Supersampled) -> None:
         """`others`: the base itself among them; `reference`: what adapting aims at."""
         self.base, self.reference = base, reference
-        means = base.model.parameters()["means"]
-        self.sampling, self._device = Sampling(means, base.views()), means.device
+        views, self._device = base.views(), base.model.parameters()["means"].device
+        self.sampling = Sampling(places(base.model, views[0]), views)
         self.sources: dict[str, Source] = {}
         for source in (*others, reference):
             self.add(source)
@@ -62,10 +63,14 @@ class Stage:
         self.sources[name] = source
         return name
 
+    def camera(self, look: Look, screen: Camera) -> Camera:
+        """The camera of the picture that a screen shows, with the zoom of its lens."""
+        return self.sampling.with_lens(smaller(replace(screen, time=look.time), 1 / look.pixel))
+
     @torch.no_grad()
     def draw(self, look: Look, screen: Camera, coarse: float = 1.0) -> Picture:
         """Draw what a screen shows; `coarse`: the fraction of its width and height that is drawn. Raises SettingsError, BackendUnavailable."""
-        camera = smaller(replace(screen, time=look.time), 1 / look.pixel)
+        camera = self.camera(look, screen)
         zoom = self.sampling.of(camera).zoom
         drawn = smaller(camera, coarse)
         request = Request(drawn, zoom, look.viewer, drawn.height / camera.height if coarse < 1 else 1.0)

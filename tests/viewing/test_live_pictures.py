@@ -7,15 +7,19 @@ from dataclasses import replace
 import anchor_checkpoints
 import mip_checkpoints
 import moving
+import numpy as np
 import pytest
 import tiny
 import torch
 from live_screen import SIZE
 
 from mipmap_plugin import wrap_model
+from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.camera import of_base_scale
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.models.base import why_no_viewer
+from mipmap_plugin.viewing.around import views_for_screen
 from mipmap_plugin.viewing.pace import COARSEST, MOVING_S, Pace
 from mipmap_plugin.viewing.screen import LARGEST_FOV, Sampling, by_distance, by_lens, inside, pose_of, up_of, zoomed
 from mipmap_plugin.viewing.sources import File, Levels, Request, Supersampled, of_adapted, open_source
@@ -201,3 +205,38 @@ def test_a_first_moving_picture_is_coarse_and_later_ones_are_as_fine_as_time_all
     for _ in range(20):
         pace.learn(pixels=1000, seconds=MOVING_S)
     assert pace.fraction(1000) == pytest.approx(1) and pace.fraction(4000) == pytest.approx(1 / 2) and pace.fraction(10**9) == COARSEST
+
+
+# Levels of detail of Octree-GS
+
+
+@pytest.fixture
+def octree(tmp_path):
+    """Octree-GS's scene on a stage, from which one walks away: four times as far, through the lens of the training."""
+    info = np.zeros(200)
+    info[:2] = anchor_checkpoints.VOXEL, 40.0  # the distance of level 0, which is beyond that of the walk
+    ply = anchor_checkpoints.write(tmp_path / "octree", anchor_checkpoints.Layout("octree"), count=200, info=info)
+    base = wrap_model(ply, cameras=tiny.cameras(4))
+    stage = Stage(base, [File("base", base)], Supersampled("supersampled", base))
+    view = base.cameras[0]
+    far = by_distance(pose_of(view, float(view.center.norm())), 1 / 4).camera(view.width, view.height)
+    return base, stage, far
+
+
+def test_octree_gs_counts_a_distance_once(octree):
+    """Its own rule is of distances and of the lens."""
+    base, stage, far = octree
+    drawn = stage.draw(Look("base"), far).image
+    assert torch.equal(drawn, base.render(far).image.clamp(0, 1))
+    assert not torch.equal(drawn, base.render(replace(far, zoom=1 / 4)).image.clamp(0, 1))
+    assert stage.draw(Look("base"), far.zoomed(1 / 2)).drawn.zoom == pytest.approx(1 / 2, rel=1e-3)
+
+
+def test_views_for_a_distant_screen_show_its_levels_and_their_truth_those_of_the_training(octree):
+    base, stage, far = octree
+    levels = base.model.wanted_levels
+    screen = stage.camera(Look("base"), far)
+    view = views_for_screen(base, screen, torch.zeros(3, dtype=torch.float64), 1 / 4)[0].looking_from(far.viewmat, "in its place")
+    assert torch.equal(levels(view.zoomed(1 / 4)), levels(screen)) and levels(screen).max() > 0
+    truth, _ = BaseImages(base.model, base.backend()[0], base.effects())._shot(of_base_scale([view])[0], 1 / 2)
+    assert torch.equal(levels(truth), levels(replace(far, zoom=4.0))) and truth.size == view.resized(view.width // 2, view.height // 2).size

@@ -26,7 +26,7 @@ from mipmap_plugin.adaptation.target.resize import difference_from
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import SplatModel, count_of
+from mipmap_plugin.models.base import SplatModel, count_of, places
 
 # Number of views on which a student is compared with the base to assess a growth.
 AGREEMENT_VIEWS = 8
@@ -69,9 +69,9 @@ class Task:
         """The number of splats that the first view shows at the new scale."""
         return count_of(model, self.views[0], self.scale)
 
-    def pixel(self, means: Tensor) -> float:
-        """The size of a target pixel at the median of `means` [N, 3], in world units."""
-        return float(pixel_size(means.detach(), self.views).median()) / self.scale
+    def pixel(self, model: SplatModel) -> float:
+        """The size of a target pixel at the median splat of a model, in world units."""
+        return float(pixel_size(places(model, self.views[0]), self.views).median()) / self.scale
 
     @torch.no_grad()
     def agreement(self, student: SplatModel, config: AdaptConfig) -> float:
@@ -126,7 +126,7 @@ class Run:
     def start(cls, student: SplatModel, task: Task, config: AdaptConfig, spent: float = 0.0) -> Run:
         """A run before its first step; `spent`: the seconds used so far."""
         means = student.parameters()["means"]
-        optimizer, watch = make_optimizer(student, config, task.pixel(means)), Stopwatch(seconds=spent)
+        optimizer, watch = make_optimizer(student, config, task.pixel(student)), Stopwatch(seconds=spent)
         with watch:
             trial, costs = Trial.begin(student, task, config), Costs(motion=lambda: task.follow.seconds, device=means.device)
             quality = costs.check(lambda: task.validation.quality(student))

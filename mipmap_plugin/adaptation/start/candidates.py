@@ -25,7 +25,7 @@ from mipmap_plugin.camera import evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import SplatModel, Thinned
+from mipmap_plugin.models.base import SPLATS, SplatModel, Thinned, places
 from mipmap_plugin.models.contract import rebuild, reshape
 from mipmap_plugin.screen_filters import INTEGRATED
 
@@ -249,7 +249,9 @@ class StartSearch:
         """Give the student's splats, which have these blend weights, the closed form."""
         if self._forms:
             with self._problem.phase("closed form"):
-                reshape(student, lambda gaussians: self._closed_form(gaussians, weights), self._problem.views)
+                views = self._problem.views
+                seen = places(student, views[0]) if student.traits.moves and student.traits.rows == SPLATS else None
+                reshape(student, lambda rest: self._closed_form(rest if seen is None else replace(rest, means=seen), weights), views)
 
     def _merge(self, student: SplatModel, weights: Tensor, fraction: float, coarsely: bool) -> Tensor:
         """Merge the student's splats down to a fraction of them, or to `most_splats`; return the blend weights of the merged splats."""

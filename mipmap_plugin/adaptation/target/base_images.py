@@ -72,9 +72,9 @@ class BaseImages:
     def _shot(self, view: Camera, fraction: float) -> tuple[Camera, Effects]:
         """The camera of an image, and how it is rendered."""
         # Resized, not zoomed: the model sees the `zoom` of its training, so that it shows the same splats, only with fewer pixels.
-        factor = fraction / view.zoom  # a view of a band (`over_band`) samples `zoom` times as finely as the base
+        factor = fraction * view.base_zoom / view.zoom  # a view of a band (`over_band`) samples more or less finely than the base
         size = (max(1, round(pixels * factor)) for pixels in (view.width, view.height))
-        camera = view if (factor, view.zoom) == (1, 1) else replace(view.resized(*size), zoom=1.0)
+        camera = view if factor == 1 and view.zoom == view.base_zoom else replace(view.resized(*size), zoom=view.base_zoom)
         return camera, replace(self.effects, eps2d=self.effects.eps2d * fraction**2)
 
     def _splats(self, camera: Camera) -> Gaussians:
@@ -94,4 +94,4 @@ def _versions(model: SplatModel) -> list[int]:
 def facts(view: Camera) -> Hashable:
     """Everything that an image depends on. Cameras are compared by identity, but each call generates its random views anew."""
     pose = view.viewmat.numpy().tobytes()
-    return view.width, view.height, view.fx, view.fy, view.cx, view.cy, pose, view.time, view.zoom, view.index
+    return view.width, view.height, view.fx, view.fy, view.cx, view.cy, pose, view.time, view.zoom, view.base_zoom, view.index

@@ -53,7 +53,7 @@ class PseudoTruth:
             return
         sizes: dict[tuple[int, int, float], list[Camera]] = {}
         for view in new:
-            sizes.setdefault((view.width, view.height, view.zoom), []).append(view)
+            sizes.setdefault((view.width, view.height, view.zoom / view.base_zoom), []).append(view)
         for same in sizes.values():
             self._store.of_one_size(same, partial(self._make_together, same))
 
@@ -71,14 +71,14 @@ class PseudoTruth:
             photograph = self._photographs(view) if self._photographs else None
             target = self._base(view) if photograph is None else photograph
         else:
-            target = resize(self._base(view, resolution(self._config, self._scale, view.zoom)), size, self._config.resize)
+            target = resize(self._base(view, resolution(self._config, self._scale, view.zoom / view.base_zoom)), size, self._config.resize)
         return quantized(target, self._config)
 
     @torch.no_grad()
     def _make_together(self, same: Sequence[Camera], numbers: Sequence[int]) -> Tensor:
         """The truths [V, h, w, 3] of some of the views of one size, by their numbers."""
         views = [same[number] for number in numbers]
-        images = self._base.of_one_size(views, 1.0 if self._scale > 1 else resolution(self._config, self._scale, views[0].zoom))
+        images = self._base.of_one_size(views, 1.0 if self._scale > 1 else resolution(self._config, self._scale, views[0].zoom / views[0].base_zoom))
         truths = images if self._scale > 1 else resize_all(images, views[0].zoomed(self._scale).size, self._config.resize)
         return quantized(truths, self._config)
 
@@ -86,7 +86,7 @@ class PseudoTruth:
 def resolution(config: AdaptConfig, scale: float, zoom: float = 1.0) -> float:
     """The fraction of the base scale at which the base is rendered: more than `truth_oversampling` samples a pixel gain nothing.
 
-    `zoom`: of the view, in a band.
+    `zoom`: of the view relative to the base scale, in a band.
     """
     return 1.0 if config.truth_oversampling is None else min(1.0, config.truth_oversampling * scale * zoom)
 

@@ -29,7 +29,7 @@ ALMOST_ONE = 0.9999  # the original's: progressive levels are clamped just short
 
 
 class OctreeModel(AnchorModel):
-    """Anchors of level 0 are the coarsest. `Camera.zoom` is 1 / the original's `resolution_scale`."""
+    """Anchors of level 0 are the coarsest. `Camera.zoom` is 1 / the original's `resolution_scale`; distances count beside it."""
 
     family = "octree"
 
