@@ -17,7 +17,7 @@ from mipmap_plugin.commands.resuming import resumable, resume_path
 from mipmap_plugin.commands.types import BackendName, Background, Scales, ScreenFilter, Seed, Threads, unique_scales
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.config import ResizeFilter
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, plural
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, write_json
 from mipmap_plugin.jobs.base import Base
 
@@ -187,7 +187,7 @@ def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], cameras: Sequenc
 
 def _title(checkpoint: Sequence[Path], images: Sequence[Path], protocol: str, judged: Sequence[int]) -> str:
     """`judged`: the number of judged views of each checkpoint."""
-    views = f"{_listed(judged)} view{'' if [*judged] == [1] else 's'}"
+    views = plural(judged[0], "view") if len(judged) == 1 else f"{_listed(judged)} views"
     return f"{_listed(checkpoint)}; truth: {protocol} from {_listed(images)}, real dB over {views}"
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.adaptation.adapted import Adapted
+from mipmap_plugin.errors import plural
 from mipmap_plugin.levels.contents import Contents, Level
 from mipmap_plugin.levels.distance.manifest import Contents as DistanceContents
 from mipmap_plugin.levels.store import LevelStore
@@ -24,7 +25,7 @@ class Ladder:
     _write: Callable[[Any, Path, bool], Path]  # contents, folder, whether to overwrite
 
     def __repr__(self) -> str:
-        return f"<Ladder: {len(self.levels)} levels>"
+        return f"<Ladder: {plural(len(self.levels), 'level')}>"
 
     @property
     def levels(self) -> list[Level] | list[Adapted]:

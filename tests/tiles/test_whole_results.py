@@ -64,7 +64,7 @@ def test_a_large_scene_takes_fewer_steps_in_tiles_too(job, monkeypatch):
     [
         ({}, "2 tiles of 4 steps", 4),
         ({"target_db": 1.0, "warm_up": 0.5}, "target of 1 dB against the pseudo truth, 2 tiles of 2 steps", 2),
-        ({"time_budget_s": 1e-6}, "time budget of 1e-06 s, 2 tiles of 1 steps at most", 1),
+        ({"time_budget_s": 1e-6}, "time budget of 1e-06 s, 2 tiles of 1 step at most", 1),
         ({"steps": 0}, "2 tiles of 0 steps", 0),
     ],
 )

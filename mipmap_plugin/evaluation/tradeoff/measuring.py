@@ -19,6 +19,7 @@ from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import plural
 from mipmap_plugin.evaluation.cells import Cells
 from mipmap_plugin.evaluation.measure import (
     BASE,
@@ -189,7 +190,7 @@ def _measured(point: Point, show: RenderView, truth: GroundTruth, repeats: int) 
 
 
 def _name(recipe: str, steps: int | None) -> str:
-    return recipe if steps is None else f"{recipe}, {steps} steps at most"
+    return recipe if steps is None else f"{recipe}, {plural(steps, 'step')} at most"
 
 
 def _spreads(**values: Sequence[float]) -> dict[str, Any]:
