@@ -11,7 +11,6 @@ from statistics import fmean
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.config import AdaptConfig
@@ -34,6 +33,7 @@ from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.photographs import digest_of_image
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, not_held_out, views_of_placed
 from mipmap_plugin.evaluation.shots import Recorder, Shot, Watcher
+from mipmap_plugin.progress import Bar
 from mipmap_plugin.recipes import most_steps
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
@@ -91,7 +91,7 @@ class Evaluator:
         """The mean quality of `show(camera at the base scale)` over the views. PSNRs of views are averaged, as in the literature."""
         psnrs, similarities, distances = [], [], []
         watch = warm_stopwatch(show, self.views[0].camera)
-        for view in tqdm(self.views, disable=None, desc=f"{name} x{scale:g}", leave=False):
+        for view in Bar(self.views, desc=f"{name} x{scale:g}", leave=False):
             with torch.no_grad(), watch:
                 image = show(view.camera)
             image, truth = self.protocol.as_saved(image), view.truth(scale, self.protocol).to(image)

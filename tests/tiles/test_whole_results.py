@@ -109,9 +109,9 @@ def test_a_model_folder_is_written_beside_the_checkpoint(job, capsys):
 
 def test_the_bar_of_a_tile_says_which_it_is_and_no_db(job, monkeypatch):
     """Which it has not: it is measured as a part of the whole."""
-    told, began = [], loop.Bar.__init__
-    monkeypatch.setattr(loop.Bar, "__init__", lambda bar, **options: (told.append(options["desc"]), began(bar, **options))[1])
-    monkeypatch.setattr(loop.Bar, "set_postfix_str", lambda bar, text: told.append(text))
+    told, began = [], loop.StepsBar.__init__
+    monkeypatch.setattr(loop.StepsBar, "__init__", lambda bar, **options: (told.append(options["desc"]), began(bar, **options))[1])
+    monkeypatch.setattr(loop.StepsBar, "set_postfix_str", lambda bar, text: told.append(text))
     monkeypatch.setattr(run, "announced", lambda what: (told.append(what), nullcontext())[1])
     adapt_in_tiles(replace(job, settings=job.settings | {"closed_form": False, "steps": 2}), 2)
     assert set(told) == {"cutting", "adapting tile 1 x0.5", "adapting tile 2 x0.5", "40 splats", "measuring the whole", "writing out.ply"}
