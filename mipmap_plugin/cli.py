@@ -45,7 +45,7 @@ def _alone(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
-        with voice.alone():
+        with voice.alone(json=kwargs.get("json", False)):
             command(*args, **kwargs)
 
     return run
