@@ -158,12 +158,15 @@ def _refuse(jobs: Sequence[Job]) -> None:
     for job in jobs:
         job.config()
         if job.overwrite and (base := bases.get(job.target.resolve())):
-            raise SettingsError(f"{job.target} holds a checkpoint that is to be adapted too ({base}); choose another --output")
+            raise SettingsError(f"{from_here(job.target)} holds a checkpoint that is to be adapted too ({from_here(base)}); choose another --output")
         if job.viewer is not None:
             viewers_for(job.viewer)
         if (other := makers.setdefault(job.target, job)) is not job:
-            both = f"{other.base.checkpoint} and {job.base.checkpoint}"
-            raise SettingsError(f"{both} would both be written to {job.target}; leave --output out, or adapt them one by one")
+            one, two = (from_here(each.base.checkpoint) for each in (other, job))
+            both, remedy = f"{one} and {two}", "leave --output out"
+            if one == two:
+                both, remedy = f"two scales of {one}", "give scales that differ more"
+            raise SettingsError(f"{both} would both be written to {from_here(job.target)}; {remedy}, or adapt them one by one")
 
 
 def _part(text: str | None) -> tuple[int, int]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.formats.here import from_here
+from mipmap_plugin.formats.here import from_here, told_from_here
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.recipes import recipe
 
@@ -57,4 +57,4 @@ class Outcome:
 
     def __str__(self) -> str:
         said = self.reason if self.reason.startswith(self.status) else ", ".join(filter(None, (self.status, self.reason)))
-        return f"{self.job}: {said}"
+        return f"{self.job}: {told_from_here(said)}"

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from mipmap_plugin.errors import plural
-from mipmap_plugin.formats.here import from_here
+from mipmap_plugin.formats.here import from_here, told_from_here
 from mipmap_plugin.jobs.job import Job, Outcome
 
 COLUMNS = ("checkpoint", "scale", "viewer", "outcome", "splats", "dB", "seconds", "file, or what is wrong")
@@ -45,7 +45,7 @@ def _psnr(report: dict[str, Any]) -> str:
 
 
 def _last(outcome: Outcome) -> str:
-    return from_here(outcome.file) if outcome.file else outcome.reason
+    return from_here(outcome.file) if outcome.file else told_from_here(outcome.reason)
 
 
 def totals(outcomes: Sequence[Outcome], count: int) -> str:

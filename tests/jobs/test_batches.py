@@ -28,6 +28,14 @@ def test_a_broken_scene_does_not_stop_the_others(run, scenes):
     assert {path.name for path in scenes.iterdir()} >= {"chair_x0.5", "chair_x4", "lego_x0.5", "lego_x4"}
 
 
+def test_what_a_job_failed_by_is_told_by_its_path_from_here(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tiny.ply(tmp_path / "a b.ply")
+    code, out, err = run("adapt", "a b.ply", "no where.ply", "--scale", "1/2", *NO_STEP)
+    assert code == 2 and "  no where.ply does not exist" in out and "failed, no where.ply does not exist" in err
+    assert str(tmp_path) not in out + err
+
+
 def test_jobs_that_fail_side_by_side_leave_no_empty_folder(run, scenes, tmp_path, monkeypatch):
     """Each of them removes what it made, but not what the other one had made before."""
 
@@ -122,7 +130,8 @@ def test_cameras_of_each_scene(run, tmp_path):
         ("a.ply b.ply --scale 4 --jobs 2 --dask local:2", "leave one of them out"),
         ("a.ply --scale 4 --send-files", "--send-files sends them to the workers of --dask"),
         ("a.ply b.ply --scale 4 --jobs 2 --send-files", "--send-files sends them to the workers of --dask"),
-        ("x/a.ply y/a.ply --scale 4 --output new", "would both be written to"),
+        ("x/a.ply y/a.ply --scale 4 --output new", ": x/a.ply and y/a.ply would both be written to new/a_x4.ply; leave --output out"),
+        ("a.ply b.ply --scale 4 --scale 4.0000001", ": two scales of a.ply would both be written to a_x4.ply; give scales that differ more"),
         ("*.spz --scale 4", "no file or folder fits this pattern"),
         ("--list nowhere.txt --scale 4", "nowhere.txt: No such file"),
     ],
