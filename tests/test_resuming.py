@@ -12,12 +12,16 @@ import pytest
 import tiny
 from running import wait_until
 
+from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.cli import main
-from mipmap_plugin.evaluation.cells import Cells
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.evaluation.cells import Cells, made_by
+from mipmap_plugin.evaluation.evaluate import _adapted_rows, training_free_rows
 from mipmap_plugin.evaluation.measure import adapt_alone
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.recipes import RECIPES
+from mipmap_plugin.wrap import wrap_model
 
 
 @pytest.fixture
@@ -161,6 +165,23 @@ def test_a_cell_is_found_by_all_that_it_depends_on(tmp_path):
     [file] = tmp_path.iterdir()
     file.write_bytes(file.read_bytes()[:-9])
     assert Cells(tmp_path, {"base": "a"}).find({"row": "base", "scale": 0.5}) is None
+
+
+def test_cells_of_another_network_of_that_name_are_not_found(tmp_path):
+    network, keys = tmp_path / "net.pth", []
+    for content in (b"one", b"one", b"other"):
+        network.write_bytes(content)
+        keys.append(made_by(AdaptConfig(upsampler=str(network))))
+    assert keys[0] == keys[1] != keys[2]
+
+
+@pytest.mark.parametrize(("rows", "key"), [(training_free_rows, ()), (_adapted_rows, (["instant"],))])
+def test_rows_are_kept_by_the_network_that_made_them(tmp_path, rows, key):
+    (tmp_path / "net.pth").write_bytes(b"one")
+    keys, settings = [], {"upsampler": str(tmp_path / "net.pth")}
+    judge = SimpleNamespace(cell=lambda key, measure: keys.append(str(key)), protocol=PROTOCOLS["P3"])
+    rows(wrap_model(tiny.model(5), cameras=tiny.cameras(1)), judge, 2.0, *key, **({"settings": settings} if key else settings))
+    assert keys and all(network_input(settings["upsampler"])["network"] in key for key in keys)
 
 
 def test_without_a_place_nothing_is_kept(tmp_path, monkeypatch):

@@ -103,10 +103,10 @@ def jobs_of(checkpoint: Path, request: Request, base: Base, *, several: bool) ->
     """The job of one checkpoint for each scale and viewer. `several`: the output is a folder for all."""
     own = replace(base, checkpoint=checkpoint.absolute(), cameras=_of_scene(base.cameras, checkpoint))
     settings, images = dict(request.settings), _of_scene(request.images, checkpoint)
-    recipe, jobs = settings.pop("recipe"), []
+    recipe, network, jobs = settings.pop("recipe"), Path(settings.get("upsampler", "")).absolute(), []
     for scale, viewer in request.targets:
         target = adapted_path(checkpoint, request.output, scale, viewer, several=several).absolute()
-        jobs.append(Job(own, target, scale, viewer, recipe, settings, images, request.overwrite))
+        jobs.append(Job(own, target, scale, viewer, recipe, settings, images, request.overwrite, network if network.is_file() else None))
     return jobs
 
 

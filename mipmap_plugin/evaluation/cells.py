@@ -13,8 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.adaptation.report import versions
+from mipmap_plugin.adaptation.target.upsamplers import network_input
+from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.torch_file import load_torch, save_torch
+
+
+def made_by(config: AdaptConfig) -> dict[str, Any]:
+    """The settings of an adaptation for a cell's key, with a hash of the network that they name by its path."""
+    return config.model_dump() | network_input(config.upsampler)
 
 
 class Cells:

@@ -13,9 +13,10 @@ from typing import Any
 import torch
 
 from mipmap_plugin.adaptation.adapted import Adapted
+from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError, unknown
-from mipmap_plugin.evaluation.cells import Cells
+from mipmap_plugin.evaluation.cells import Cells, made_by
 from mipmap_plugin.evaluation.measure import (
     FILTERS,
     Baseline,
@@ -122,9 +123,11 @@ def training_free_rows(
     found = baselines(model, scale, judge.protocol.shrink_by, filters=filters, upsampler=upsampler)
     in_viewers = [base_in_viewer(name, model, scale) for name in viewers_for(viewer)] if viewer else []
 
+    network = network_input(upsampler)
+
     def row(baseline: Baseline) -> Row:
         name, render, count = baseline.name, baseline.render, baseline.gaussians
-        return judge.cell({"row": name, "scale": scale}, lambda judge: judge.row(name, scale, render, gaussians=count))
+        return judge.cell({"row": name, "scale": scale} | network, lambda judge: judge.row(name, scale, render, gaussians=count))
 
     return [row(baseline) for baseline in found] + worst([row(baseline) for baseline in in_viewers])
 
@@ -207,7 +210,7 @@ def _adapted_rows(model: Wrapped, judge: Evaluator, scale: float, recipes: Seque
         adapted = adapt_alone(model, scale, recipe=name, **own)
         return adapted_row(f"{name}, {'scored' if on == 'scored' else _unseen(judge.views, adapted)}", adapted, judge)
 
-    made = {name: config_of(name, scale, settings).model_dump() for name in recipes}  # a registered recipe may have been edited since
+    made = {name: made_by(config_of(name, scale, settings)) for name in recipes}  # a registered recipe may have been edited since
     each = product(recipes, ("train", "scored"))
     return [judge.cell({"recipe": name, "made": made[name], "on": on, "scale": scale}, partial(row, name, on)) for name, on in each]
 

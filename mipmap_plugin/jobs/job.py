@@ -26,6 +26,7 @@ class Job:
     settings: dict[str, Any] = field(default_factory=dict)  # that override those of the recipe: seed, steps, ...
     images: Path | None = None  # a scene whose photographs are the truth of a zoom-in
     overwrite: bool = False
+    network: Path | None = None  # where the network's file lies that the settings name as `upsampler`
     skip_finished: bool = True  # do nothing if the target was made from the same base with the same settings
 
     needs_folder: ClassVar[str] = ""  # why the files of such a job cannot be sent, in a sentence

@@ -7,7 +7,9 @@ import pytest
 import tiny
 from small_jobs import QUICK, job_of
 
+from mipmap_plugin.commands.many import Request, jobs_of
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Outcome
 from mipmap_plugin.jobs.listing import find_checkpoints, read_list, shard, without_outputs
 from mipmap_plugin.jobs.run import run as run_job
@@ -148,6 +150,16 @@ def test_without_words_a_checkpoint_is_asked_for(run):
 
 
 # Lists
+
+
+def test_jobs_know_where_the_network_lies_that_the_command_names_from_its_folder(tmp_path, monkeypatch):
+    """A worker may run in another folder."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "net.pth").write_bytes(b"")
+    for name, file in {"net.pth": tmp_path / "net.pth", "lanczos": None}.items():
+        request = Request([(2.0, None)], None, {"recipe": "default", "upsampler": name}, None, False)
+        [job] = jobs_of(tmp_path / "a.ply", request, Base(Path()), several=False)
+        assert (job.network, job.settings["upsampler"]) == (file, name)
 
 
 def test_shards_are_all_jobs_each_once():

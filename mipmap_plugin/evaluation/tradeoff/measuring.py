@@ -19,7 +19,7 @@ from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import plural
-from mipmap_plugin.evaluation.cells import Cells
+from mipmap_plugin.evaluation.cells import Cells, made_by
 from mipmap_plugin.evaluation.measure import (
     BASE,
     FILTERS,
@@ -88,7 +88,7 @@ class _Measurement:
 
     def _made(self, recipe: str) -> dict[str, Any]:
         """The settings of a recipe; a registered one may have been edited since an interruption."""
-        return make_config(recipe, self._scale).model_dump()
+        return made_by(make_config(recipe, self._scale))
 
     def _kept(self, key: dict[str, Any], measure: Callable[[], list[Point]]) -> list[Point]:
         """The points of a cell: measured now, or kept from before an interruption."""
