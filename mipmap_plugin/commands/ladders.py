@@ -71,12 +71,14 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     from mipmap_plugin.levels.ladder import refuse_no_viewer
     from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
     from mipmap_plugin.levels.room import room_for
+    from mipmap_plugin.levels.store import is_of
     from mipmap_plugin.levels.streamed import SINGLE_LEVEL
     from mipmap_plugin.models.outputs import refuse_far
     from mipmap_plugin.models.places import state_path
     from mipmap_plugin.process import threads
 
     unfinished = settled(state_path(output))
+    overwrite = overwrite or is_of(unfinished, output)
     refuse_no_viewer(wrapped.model)
     refuse_ladder(output, wrapped, overwrite=overwrite)
     with announced("planning the levels"):
@@ -98,7 +100,7 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
         with threads.limited_for(wrapped.backend()[0], wrapped.threads):
             files = exports.write(folder, ladder.contents)
     except (KeyboardInterrupt, MipmapPluginError) as error:
-        again = f"{folder} has the levels, and the same command with --overwrite goes on from these"
+        again = f"{folder} has the levels, and the same command goes on from these"
         raise type(error)(f"{str(error) or 'interrupted'}; {again}") from error
     ladder.forget()
     return read_manifest(folder), files

@@ -39,8 +39,7 @@ class Ladder:
         `keep_resume`: leave what was kept to go on from until `forget`.
         """
         saved = self._write(self.contents, path_of(folder), overwrite)
-        if not keep_resume:
-            self.forget()
+        self._store.note(saved) if keep_resume else self.forget()
         return saved
 
     def forget(self) -> None:
