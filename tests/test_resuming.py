@@ -15,6 +15,7 @@ from running import wait_until
 from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.cli import main
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.errors import OutputError
 from mipmap_plugin.evaluation.cells import Cells, made_by
 from mipmap_plugin.evaluation.evaluate import _adapted_rows, training_free_rows
 from mipmap_plugin.evaluation.measure import adapt_alone
@@ -100,7 +101,7 @@ def test_a_folder_with_other_things_is_not_deleted(folder, capsys, command):
 
 def test_rows_of_another_background_are_measured_again(folder, monkeypatch):
     """Which is not in the checkpoint's own bytes."""
-    monkeypatch.setattr("mipmap_plugin.commands.evaluate.shutil", SimpleNamespace(rmtree=lambda *_, **__: None))
+    monkeypatch.setattr("mipmap_plugin.commands.evaluate.delete", lambda _: None)
     words = ["evaluate", str(folder / "base"), "--images", str(folder / "scene"), "--scale", "1/2"]
     psnrs = []
     for white in (False, True):
@@ -113,7 +114,7 @@ def test_rows_of_another_background_are_measured_again(folder, monkeypatch):
 
 def test_rows_of_another_truth_are_measured_again(folder, monkeypatch):
     """As of an older version, whose protocol made another of the same photographs."""
-    monkeypatch.setattr("mipmap_plugin.commands.evaluate.shutil", SimpleNamespace(rmtree=lambda *_, **__: None))
+    monkeypatch.setattr("mipmap_plugin.commands.evaluate.delete", lambda _: None)
     words = ["evaluate", str(folder / "base"), "--images", str(folder / "scene"), "--scale", "1/2", "--protocol", "P1"]
     rows = []
     for truncate in (False, True, True):
@@ -129,7 +130,7 @@ def test_what_another_recipe_of_that_name_made_is_measured_again(folder, monkeyp
     words = [command, str(folder / "base"), "--images", str(folder / "scene"), "--scale", "1/2", "--recipe", "mine"]
     words += ["--no-picture", "--no-renderers", "--repeats", "1", "--supersampling", "2"] if command == "tradeoff" else []
     for kept in ("commands.evaluate", "evaluation.cells"):
-        monkeypatch.setattr(f"mipmap_plugin.{kept}.shutil", SimpleNamespace(rmtree=lambda *_, **__: None))
+        monkeypatch.setattr(f"mipmap_plugin.{kept}.delete", lambda _: None)
     made, counts = [], []
     place = f"mipmap_plugin.evaluation.{module}.adapt_alone"
     monkeypatch.setattr(place, lambda *args, **settings: made.append(args) or adapt_alone(*args, **settings))
@@ -138,6 +139,15 @@ def test_what_another_recipe_of_that_name_made_is_measured_again(folder, monkeyp
             assert main([*words, "--output", str(folder / "rows.json"), "--overwrite"]) == 0
         counts.append(len(made))
     assert 0 < counts[0] == counts[1] and counts[2] == 2 * counts[0]
+
+
+def test_a_command_that_ends_between_its_two_files_is_not_in_its_own_way(folder, capsys, monkeypatch):
+    words = ["evaluate", str(folder / "base"), "--images", str(folder / "scene"), "--scale", "1/2", "--output", str(folder / "rows.json")]
+    with monkeypatch.context() as failing:
+        failing.setattr("mipmap_plugin.commands.evaluate.write_json", lambda *_: (_ for _ in ()).throw(OutputError("the disk is full")))
+        assert main(words) == 2
+    assert main(words) == 0, capsys.readouterr().err
+    assert {path.name for path in folder.iterdir()} == {"base", "scene", "rows.json", "rows.html"}
 
 
 def test_the_scene_is_not_replaced_by_the_rows(folder, capsys):

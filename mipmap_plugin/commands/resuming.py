@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from mipmap_plugin.errors import SettingsError, plural
+from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.progress import note
 
 # The name of a cell's file, or of the folder in which it is written.
@@ -25,7 +26,7 @@ def resumable(folder: Path | None, unit: str) -> Iterator[None]:
 
     Raises SettingsError for a folder with other things in it, because it is deleted at the end.
     """
-    if folder is not None and folder.exists() and not (folder.is_dir() and all(CELL.fullmatch(path.name) for path in folder.iterdir())):
+    if folder is not None and settled(folder).exists() and not (folder.is_dir() and all(CELL.fullmatch(path.name) for path in folder.iterdir())):
         raise SettingsError(f"{folder} is needed for what is finished, but is or holds something else; move it, or choose another output")
     if found := _cells(folder):
         note(f"{folder} has {plural(found, unit)} of a command that was interrupted; those of the same request are not measured again")
