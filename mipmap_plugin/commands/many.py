@@ -12,7 +12,7 @@ from typing import Any
 from mipmap_plugin.commands.common import print_json
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.voice import say
-from mipmap_plugin.errors import JobsFailed, SettingsError, install
+from mipmap_plugin.errors import JobsFailed, SettingsError, install, plural
 from mipmap_plugin.formats.here import from_here
 from mipmap_plugin.formats.staging import missing_folders, remove_empty
 from mipmap_plugin.jobs.base import Base
@@ -86,7 +86,7 @@ def adapt_many(many: Many, given: Sequence[Path], request: Request, base: Base, 
         remove_empty(sorted(missing, key=lambda folder: len(folder.parts), reverse=True))
     _print(outcomes, jobs, json)
     if failed := [outcome for outcome in outcomes if outcome.status != "done" and outcome.status != "finished before"]:
-        raise JobsFailed(f"{len(failed)} of {len(jobs)} jobs failed; the same command does these again, and no other")
+        raise JobsFailed(f"{len(failed)} of {plural(len(jobs), 'job')} failed; the same command does these again, and no other")
 
 
 def make_jobs(many: Many, given: Sequence[Path], request: Request, base: Base) -> list[Job]:
