@@ -156,6 +156,12 @@ def test_the_scene_is_not_replaced_by_the_rows(folder, capsys):
     assert "never replaced" in capsys.readouterr().err and (folder / "scene" / "transforms_test.json").read_bytes() == before
 
 
+def test_the_cameras_are_not_replaced_by_the_rows(folder, capsys):
+    before = (folder / "base" / "cameras.json").rename(folder / "cameras.json").read_bytes()
+    assert main([*evaluate(folder, "cameras.json"), "--cameras", str(folder / "cameras.json"), "--overwrite"]) == 2
+    assert "never replaced" in capsys.readouterr().err and (folder / "cameras.json").read_bytes() == before
+
+
 def test_rows_and_page_are_two_files(folder, capsys):
     assert main(evaluate(folder, "rows.html")) == 2
     assert "give the rows another name" in capsys.readouterr().err and not (folder / "rows.html").exists()

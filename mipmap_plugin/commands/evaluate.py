@@ -181,6 +181,7 @@ def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], cameras: Sequenc
     if len(set(outputs)) < len(outputs):
         raise SettingsError(f"{outputs[0]}: the page is written there; give the rows another name, such as {outputs[0].with_suffix('.json')}")
     read = [part for path in checkpoint for part in _parts(path)] + [file for folder in images for file in folder.glob("transforms*.json")]
+    read += cameras
     for output in outputs:
         refuse_output(output, overwrite, read, is_file=True)
         refuse_unwritable(output)
