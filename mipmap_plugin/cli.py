@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -26,7 +27,7 @@ from mipmap_plugin.commands.render import render
 from mipmap_plugin.commands.repeated import refuse_repeated
 from mipmap_plugin.commands.tradeoff import tradeoff
 from mipmap_plugin.commands.view import view
-from mipmap_plugin.errors import MipmapPluginError, of_a_file
+from mipmap_plugin.errors import MipmapPluginError, SettingsError, of_a_file
 from mipmap_plugin.limits import is_out_of_memory
 from mipmap_plugin.process.freed_memory import keep_freed_memory
 from mipmap_plugin.process.garbage import leave_at_exit
@@ -45,7 +46,7 @@ def _alone(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
-        with voice.alone():
+        with voice.alone(json=kwargs.get("json", False)):
             command(*args, **kwargs)
 
     return run
@@ -87,6 +88,8 @@ def _run(words: Sequence[str]) -> int:
     with ends_as_by_ctrl_c() as ending:
         try:
             with _our_warnings_only():
+                if any(not word or re.fullmatch("--[^=]+=", word) for word in words):  # "" would be a path, to this folder
+                    raise SettingsError("a word of this command is empty, as where a variable of the shell is not set; fill it in, or leave it out")
                 if words and words[0] in COMMANDS:
                     refuse_repeated(COMMANDS[words[0]], words)
                 app.cli(prog="mipmap-plugin", description=DESCRIPTION, args=words)

@@ -92,6 +92,11 @@ def with_article(noun: str) -> str:
     return f"{'an' if noun[:1].lower() in 'aeio' else 'a'} {noun}"
 
 
+def plural(count: int, noun: str) -> str:
+    """A number of things: "1 view", "1,200 views"."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
 def type_of(value: object) -> str:
     """The type of what was given in place of something else, behind its article."""
     return with_article(type(value).__name__)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from tqdm import tqdm
 
@@ -15,10 +16,29 @@ Item = TypeVar("Item")
 # Seconds before anything is shown, and between two looks at the clock.
 PATIENCE, PERIOD = 1.0, 0.5
 
+# The size that a terminal is taken to have which does not know its own (VT100). tqdm shows nothing there.
+COLUMNS, LINES = 80, 24
+
+
+class Bar(tqdm):  # type: ignore[misc]  # tqdm has no types
+    """A bar on standard error, if that is a terminal."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        unsized = {"ncols": COLUMNS - 1, "nrows": LINES - 1} if _has_no_size() else {}
+        super().__init__(*args, **{"disable": None, **unsized, **options})
+
+
+def _has_no_size() -> bool:
+    """Whether standard error is a terminal that reports no size, such as a serial line."""
+    try:
+        return 0 in os.get_terminal_size(sys.stderr.fileno())
+    except (OSError, ValueError, AttributeError):
+        return False
+
 
 def counted(items: Iterable[Item], total: int, what: str, unit: str) -> Iterator[Item]:
     """Yield the items, and show on a terminal how many of them are done."""
-    bar = tqdm(items, total=total, desc=what, unit=unit, disable=None)
+    bar = Bar(items, total=total, desc=what, unit=unit)
     with ticking(bar):
         yield from bar
 
@@ -26,7 +46,7 @@ def counted(items: Iterable[Item], total: int, what: str, unit: str) -> Iterator
 @contextmanager
 def told(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
     """Show progress on a terminal; the block calls the function that it is given with how many are done, and of how many."""
-    with tqdm(desc=what, unit=unit, disable=None) as shown:
+    with Bar(desc=what, unit=unit) as shown:
 
         def tell(done: int, total: int) -> None:
             shown.total = total
@@ -75,7 +95,7 @@ def meanwhile(work: Callable[[threading.Event], None]) -> Iterator[None]:
 def _show(what: str, ended: threading.Event) -> None:
     if ended.wait(PATIENCE):
         return
-    with tqdm(bar_format="{desc}: {elapsed}", desc=what, leave=False) as line:
+    with Bar(bar_format="{desc}: {elapsed}", desc=what, leave=False) as line:
         line.start_t -= PATIENCE
         while not ended.wait(PERIOD):
             line.refresh()

@@ -63,7 +63,7 @@ CONFINED = {
     "safetensors": ["adaptation/target/super_resolution.py"],
     "skimage": ["evaluation/metrics.py"],
     "spandrel": ["adaptation/target/super_resolution.py"],
-    "tqdm": ["adaptation/", "evaluation/", "progress.py"],
+    "tqdm": ["progress.py"],
     "triton": ["backends/triton"],
     "tyro": ["cli.py", "commands/"],
     "typing_extensions": ["frozen_base.py", "wrap.py"],

@@ -63,7 +63,7 @@ def run_and_estimates(clock, monkeypatch, base=None, **settings):
     evaluate = memory.Memory.evaluate
     monkeypatch.setattr(memory.Memory, "evaluate", lambda *each: clock(EVALUATION) or evaluate(*each))
     monkeypatch.setattr(Validation, "quality", lambda self, model: clock(CHECK) or Quality(20.0, 20.0))
-    monkeypatch.setattr(loop.Bar, "update", lambda bar, *_: told.append((run.watch.seconds, bar.seconds_left)))
+    monkeypatch.setattr(loop.StepsBar, "update", lambda bar, *_: told.append((run.watch.seconds, bar.seconds_left)))
     task = Task(views, SCALE, truth, [render], False, Validation([], [], SCALE, truth, [render], config.resize))
     task = replace(task, follow=Following(base, views, SCALE))
     run = Run.start(base.copy(), task, config)

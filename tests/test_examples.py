@@ -61,12 +61,13 @@ def test_the_commands_that_list_know_of_it(scene, capsys):
     assert all(f"{point.name}: {point.value}\n" in listed for point in POINTS)
 
 
-def test_a_group_of_entry_points_that_is_misspelled_is_told(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("words", [["list"], ["list", "recipes", "--json"], ["backends"]])
+def test_a_group_of_entry_points_that_is_misspelled_is_told(words, tmp_path, monkeypatch, capsys):
     (tmp_path / "stranger-1.0.dist-info").mkdir()
     (tmp_path / "stranger-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1.0\n")
     (tmp_path / "stranger-1.0.dist-info" / "entry_points.txt").write_text("[mipmap_plugin.backend]\nmine = stranger:Mine\n")
     monkeypatch.syspath_prepend(tmp_path)
-    assert cli.main(["list"]) == 0
+    assert cli.main(words) == 0
     told = "mine (stranger:Mine), in the group mipmap_plugin.backend of entry points, is not used: the groups are mipmap_plugin.backends,"
     assert told in capsys.readouterr().err
 

@@ -83,6 +83,15 @@ def test_what_is_written_for_a_viewer_is_measured_in_the_format_of_that(tmp_path
     assert [file.stat().st_size <= size for file in sorted(tmp_path.glob("base_*_*[!n]"))] == [True, True]
 
 
+@pytest.mark.parametrize("size", [4_000, 9_000])
+def test_a_small_glb_is_as_large_as_it_may_be_and_no_larger(tmp_path, size):
+    """Its head has as many bytes as tens of splats."""
+    tiny.model(500, degree=0).save(tmp_path / "base.ply", provenance={})
+    words = ["adapt", str(tmp_path / "base.ply"), "--bytes", str(size), "--recipe", "instant", "--scale", "1/2"]
+    assert cli.main([*words, "--output", str(tmp_path / "small.glb")]) == 0
+    assert size - 500 <= (tmp_path / "small.glb").stat().st_size <= size
+
+
 OPTIONS = [[], ["--viewer", "spark"], ["--viewer", "mip"], ["--scale", "1/3"], ["--viewer", "portable", "--recipe", "thorough"]]
 
 

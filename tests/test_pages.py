@@ -260,6 +260,11 @@ def test_the_lead_of_a_ladder_counts_its_levels():
     assert lead(dict(facts, levels=[level, level]), "at any zoom").startswith("2 levels for classic, 2,000 splats, 4.0 MB")
 
 
+def test_the_lead_of_a_tiny_ladder_has_a_size_and_a_splat():
+    facts = dict(viewer="classic", curve=[dict(base_db=20.0)], worst_db=20.0, mean_db=21.0, levels=[dict(splats=1, bytes=2790)])
+    assert lead(facts, "at any zoom").startswith("1 level for classic, 1 splat, 3 kB: ")
+
+
 def test_zooming_in_is_compared_with_the_base_after_shrinking(model_folder):
     base = wrap_model(model_folder)
     zoom = adaptation_zoom(base, base.adapt(2, recipe="instant"))

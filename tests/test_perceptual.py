@@ -88,14 +88,6 @@ def test_another_file_is_refused(tmp_path, random_weights):
             Perceptual("alex", file)
 
 
-def test_a_download_says_nothing_on_the_standard_output(monkeypatch, random_weights, capsys):
-    """Torch's line on it made the JSON of `evaluate` unreadable."""
-    state = torch.load(random_weights("alex"))
-    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", lambda *_, **__: print("Downloading") or state)
-    Perceptual("alex")
-    assert capsys.readouterr().out == ""
-
-
 def test_what_lacks_is_named_with_its_remedy(monkeypatch):
     def no_network(*_, **__):
         raise urllib.error.URLError("no route")

@@ -12,12 +12,17 @@ import pytest
 import tiny
 from running import wait_until
 
+from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.cli import main
-from mipmap_plugin.evaluation.cells import Cells
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.errors import OutputError
+from mipmap_plugin.evaluation.cells import Cells, made_by
+from mipmap_plugin.evaluation.evaluate import _adapted_rows, training_free_rows
 from mipmap_plugin.evaluation.measure import adapt_alone
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.recipes import RECIPES
+from mipmap_plugin.wrap import wrap_model
 
 
 @pytest.fixture
@@ -103,7 +108,7 @@ def test_a_folder_with_other_things_is_not_deleted(folder, capsys, command):
 
 def test_rows_of_another_background_are_measured_again(folder, monkeypatch):
     """Which is not in the checkpoint's own bytes."""
-    monkeypatch.setattr("mipmap_plugin.commands.evaluate.shutil", SimpleNamespace(rmtree=lambda *_, **__: None))
+    monkeypatch.setattr("mipmap_plugin.commands.evaluate.delete", lambda _: None)
     psnrs = []
     for white in (False, True):
         options = folder / "base" / "cfg_args"
@@ -114,7 +119,7 @@ def test_rows_of_another_background_are_measured_again(folder, monkeypatch):
 
 def test_rows_of_another_truth_are_measured_again(folder, monkeypatch):
     """As of an older version, whose protocol made another of the same photographs."""
-    monkeypatch.setattr("mipmap_plugin.commands.evaluate.shutil", SimpleNamespace(rmtree=lambda *_, **__: None))
+    monkeypatch.setattr("mipmap_plugin.commands.evaluate.delete", lambda _: None)
     rows = []
     for truncate in (False, True, True):
         monkeypatch.setitem(PROTOCOLS, "P1", replace(PROTOCOLS["P1"], truncate=truncate))
@@ -128,21 +133,36 @@ def test_what_another_recipe_of_that_name_made_is_measured_again(folder, monkeyp
     words = [command, str(folder / "base"), "--images", str(folder / "scene"), "--scale", "1/2", "--recipe", "mine"]
     words += ["--no-picture", "--no-renderers", "--repeats", "1", "--supersampling", "2"] if command == "tradeoff" else []
     for kept in ("commands.evaluate", "evaluation.cells"):
-        monkeypatch.setattr(f"mipmap_plugin.{kept}.shutil", SimpleNamespace(rmtree=lambda *_, **__: None))
+        monkeypatch.setattr(f"mipmap_plugin.{kept}.delete", lambda _: None)
     made, counts = [], []
     place = f"mipmap_plugin.evaluation.{module}.adapt_alone"
     monkeypatch.setattr(place, lambda *args, **settings: made.append(args) or adapt_alone(*args, **settings))
     for crispness in (0.0, 0.0, 0.5):
         with RECIPES.temporarily(mine=lambda scale, network, value=crispness: {"steps": 0, "views": "given", "crispness": value}):
-            assert main([*words, "--output", str(folder / "rows.json"), "--overwrite"]) == 0
+            assert main([*words, "--output", str(folder / "rows"), "--overwrite"]) == 0
         counts.append(len(made))
     assert 0 < counts[0] == counts[1] and counts[2] == 2 * counts[0]
+
+
+def test_a_command_that_ends_between_its_two_files_is_not_in_its_own_way(folder, capsys, monkeypatch):
+    words = ["evaluate", str(folder / "base"), "--images", str(folder / "scene"), "--scale", "1/2", "--output", str(folder / "rows.json")]
+    with monkeypatch.context() as failing:
+        failing.setattr("mipmap_plugin.commands.evaluate.write_json", lambda *_: (_ for _ in ()).throw(OutputError("the disk is full")))
+        assert main(words) == 2
+    assert main(words) == 0, capsys.readouterr().err
+    assert {path.name for path in folder.iterdir()} == {"base", "scene", "rows.json", "rows.html"}
 
 
 def test_the_scene_is_not_replaced_by_the_rows(folder, capsys):
     before = (folder / "scene" / "transforms_test.json").read_bytes()
     assert main([*evaluate(folder, "scene/transforms_test.json"), "--overwrite"]) == 2
     assert "never replaced" in capsys.readouterr().err and (folder / "scene" / "transforms_test.json").read_bytes() == before
+
+
+def test_the_cameras_are_not_replaced_by_the_rows(folder, capsys):
+    before = (folder / "base" / "cameras.json").rename(folder / "cameras.json").read_bytes()
+    assert main([*evaluate(folder, "cameras.json"), "--cameras", str(folder / "cameras.json"), "--overwrite"]) == 2
+    assert "never replaced" in capsys.readouterr().err and (folder / "cameras.json").read_bytes() == before
 
 
 def test_rows_and_page_are_two_files(folder, capsys):
@@ -164,6 +184,23 @@ def test_a_cell_is_found_by_all_that_it_depends_on(tmp_path):
     [file] = tmp_path.iterdir()
     file.write_bytes(file.read_bytes()[:-9])
     assert Cells(tmp_path, {"base": "a"}).find({"row": "base", "scale": 0.5}) is None
+
+
+def test_cells_of_another_network_of_that_name_are_not_found(tmp_path):
+    network, keys = tmp_path / "net.pth", []
+    for content in (b"one", b"one", b"other"):
+        network.write_bytes(content)
+        keys.append(made_by(AdaptConfig(upsampler=str(network))))
+    assert keys[0] == keys[1] != keys[2]
+
+
+@pytest.mark.parametrize(("rows", "key"), [(training_free_rows, ()), (_adapted_rows, (["instant"],))])
+def test_rows_are_kept_by_the_network_that_made_them(tmp_path, rows, key):
+    (tmp_path / "net.pth").write_bytes(b"one")
+    keys, settings = [], {"upsampler": str(tmp_path / "net.pth")}
+    judge = SimpleNamespace(cell=lambda key, measure: keys.append(str(key)), protocol=PROTOCOLS["P3"])
+    rows(wrap_model(tiny.model(5), cameras=tiny.cameras(1)), judge, 2.0, *key, **({"settings": settings} if key else settings))
+    assert keys and all(network_input(settings["upsampler"])["network"] in key for key in keys)
 
 
 def test_without_a_place_nothing_is_kept(tmp_path, monkeypatch):

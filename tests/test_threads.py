@@ -12,7 +12,6 @@ import tiny
 import torch
 from anchor_checkpoints import write
 from running import wait_until
-from tqdm import tqdm
 
 from mipmap_plugin import progress
 from mipmap_plugin.adaptation.target.base_images import BaseImages
@@ -181,13 +180,24 @@ def test_what_takes_seconds_of_a_large_scene_is_announced(tmp_path, monkeypatch)
 def test_the_clock_of_a_bar_goes_on_while_nothing_is_counted(monkeypatch):
     monkeypatch.setattr(progress, "PATIENCE", 0.01)
     errors = Terminal()
-    with tqdm(total=2, file=errors) as bar, progress.ticking(bar):
+    with progress.Bar(total=2, file=errors) as bar, progress.ticking(bar):
         shown = errors.getvalue()
         wait_until(lambda: errors.getvalue() != shown)
     silent = io.StringIO()
-    with tqdm(total=2, file=silent, disable=None) as bar, progress.ticking(bar):
+    with progress.Bar(total=2, file=silent) as bar, progress.ticking(bar):
         time.sleep(0.05)
     assert not silent.getvalue()
+
+
+def test_a_terminal_that_knows_no_size_shows_bars(monkeypatch):
+    """As a serial line does: tqdm takes one of 0 lines for one without room."""
+    pytest.importorskip("termios")
+    ours, theirs = os.openpty()
+    with open(theirs, "w") as terminal, open(ours, "rb"):
+        monkeypatch.setattr(sys, "stderr", terminal)
+        assert os.get_terminal_size(theirs) == (0, 0)
+        assert list(progress.counted(range(3), 3, "counting", "thing")) == [0, 1, 2]
+        assert b"counting: 100%" in os.read(ours, 4096)
 
 
 @pytest.mark.parametrize("wrong", [0, -1, 1.5, 10**9])

@@ -105,7 +105,7 @@ def test_without_undistortion_points_are_elsewhere(tmp_path):
 def test_a_distorted_scene_has_cameras_to_adapt_with_and_images_to_evaluate_on(tmp_path):
     scene = nerfstudio_scene(tmp_path / "s", "OPENCV")
     wrapped = wrap_model(tiny.model(), cameras=scene)
-    assert wrapped.adapt(1 / 4, steps=1, views="given").report.views == "the 1 given views"
+    assert wrapped.adapt(1 / 4, steps=1, views="given").report.views == "the 1 given view"
     [view] = protocols.test_views(scene, scene.cameras, (0.0, 0.0, 0.0))
     assert_dots_at(view.camera, view.truth(1.0, protocols.PROTOCOLS["P3"]))
     with pytest.raises(SettingsError, match=r"P4.*lens distortion"):

@@ -139,6 +139,28 @@ def test_a_log_that_can_be_written_no_more_does_not_end_the_command(base, capsys
     assert "verdict:" in said.out and said.err.count("\n") == 1 and "the log ends here" in said.err
 
 
+NOISY = """
+import os, subprocess, sys
+from mipmap_plugin.cli import main
+from mipmap_plugin.commands import list
+
+def facts(kind):
+    subprocess.run([sys.executable, "-c", "print('of a child')"])
+    os.write(1, b"of a library")
+    return {"built in": []}
+
+list._facts = facts
+sys.exit(main(["list", "recipes", "--json"]) or os.write(1, b"after") - 5)
+"""
+
+
+def test_json_is_alone_on_the_standard_output_whatever_prints_past_python():
+    done = subprocess.run([sys.executable, "-c", NOISY], capture_output=True, text=True)
+    printed = done.stdout.removesuffix("after")
+    assert done.returncode == 0 and printed != done.stdout and json.loads(printed) == {"recipes": {"built in": []}}
+    assert "of a child" in done.stderr and "of a library" in done.stderr
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a device that is always full")
 def test_what_cannot_be_printed_is_one_sentence():
     with open("/dev/full", "w") as full:

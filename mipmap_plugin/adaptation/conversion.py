@@ -27,7 +27,7 @@ from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import ONE_PIXEL, Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, plural
 from mipmap_plugin.models.adapted_scale import refuse_adapted
 from mipmap_plugin.models.contract import refuse_broken
 from mipmap_plugin.models.places import conversion_state
@@ -127,7 +127,7 @@ def _joined(first: Report, second: Report, stopped: bool) -> Report:
     spent = first.seconds["total"]
     seconds = {"conversion": spent, **second.seconds, "total": second.seconds["total"] + spent}
     curve = [point.model_copy(update={"seconds": point.seconds + spent}) for point in second.curve]
-    told = f"converted at x1 before, {first.gain()}, in {_steps(first)} steps{f', ended by {End.OBSERVER.value}' if stopped else ''}"
+    told = f"converted at x1 before, {first.gain()}, in {plural(_steps(first), 'step')}{f', ended by {End.OBSERVER.value}' if stopped else ''}"
     peaks = [peak for peak in (first.peak_memory_mib, second.peak_memory_mib) if peak is not None]
     notes = [*dict.fromkeys([*first.notes, *second.notes]), told]
     changes = {"seconds": seconds, "curve": curve, "notes": notes, "peak_memory_mib": max(peaks, default=None)}

@@ -12,7 +12,7 @@ from mipmap_plugin.adaptation.spreading import Halves, places, spread
 from mipmap_plugin.adaptation.viewpoints import Viewpoints
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, plural
 from mipmap_plugin.limits import derived_seed
 from mipmap_plugin.scenes.orbits import GOLDEN, ORBIT_FOV
 from mipmap_plugin.scenes.trajectories import jittered, with_company
@@ -116,17 +116,17 @@ def choose_views(cameras: Sequence[Camera], viewpoints: Viewpoints, config: Adap
         views = viewpoints.views((pixels, pixels), count, generator)
         reason = "as requested" if cameras else "the checkpoint came without cameras"
         told = f" {orbit.told()}," if orbit.up else ""
-        return views, f"{len(views)} views of a generated orbit{told} at {pixels} px ({reason})"
+        return views, f"{plural(len(views), 'view')} of a generated orbit{told} at {pixels} px ({reason})"
     if config.views == "given":
-        return list(cameras), f"the {len(cameras)} given views"
+        return list(cameras), f"the {plural(len(cameras), 'given view')}"
     split = "test" if config.views == "test" else "train"
     views = [camera for camera in cameras if camera.split == split]
     if not views:
         raise SettingsError(f"there are no {split} views among the {len(cameras)} cameras; use the view policy 'given'")
     if config.views == "jittered":
         extra = jittered(with_company(views, viewpoints.orbit), config.extra_views, generator)
-        return views + extra, f"{len(views)} train views and {len(extra)} around them"
-    return views, f"the {len(views)} {split} views"
+        return views + extra, f"{plural(len(views), 'train view')} and {len(extra)} around them"
+    return views, f"the {plural(len(views), f'{split} view')}"
 
 
 def over_band(views: Sequence[Camera], config: AdaptConfig) -> list[Camera]:

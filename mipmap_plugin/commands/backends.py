@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 
 from mipmap_plugin.commands.common import print_json
+from mipmap_plugin.commands.list import warn_of_other_groups
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 
@@ -25,6 +26,7 @@ def backends(check: str | None = None, full: bool = False, json: bool = False) -
 
     if full and check is None:
         raise SettingsError("--full needs a backend to check; give --check NAME")
+    warn_of_other_groups()
     if check is None:
         rows = tables.listing()
         return print_json([asdict(row) for row in rows]) if json else say(tables.listing_table(rows))

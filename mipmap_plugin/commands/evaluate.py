@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,8 +16,8 @@ from mipmap_plugin.commands.resuming import resumable, resume_path
 from mipmap_plugin.commands.types import BackendName, Background, Scales, ScreenFilter, Seed, Threads, unique_scales
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.config import ResizeFilter
-from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, write_json
+from mipmap_plugin.errors import SettingsError, plural
+from mipmap_plugin.formats.atomic import delete, refuse_output, refuse_unwritable, together, write_json
 from mipmap_plugin.jobs.base import Base
 
 if TYPE_CHECKING:
@@ -129,12 +128,14 @@ class _Results:
 
         self._rows += means(self._rows) if 1 < len(checkpoints) == len(set(self._scenes)) else []  # several of one scene are compared
         facts = {"rows": records(self._rows), "judged_views": self.judged, "notes": [*self._notes], "report": self._page and str(self._page)}
-        if self._page:
-            write_evaluation_page(self._page, checkpoints, self._galleries, self._rows, [*self._notes], overwrite)
-        if self._output:
-            write_json(self._output, facts, overwrite)
+        written = self._output or self._page
+        with together(written) if written else nullcontext():  # or else, after a kill between the two, one would be in the way
+            if self._page:
+                write_evaluation_page(self._page, checkpoints, self._galleries, self._rows, [*self._notes], overwrite)
+            if self._output:
+                write_json(self._output, facts, overwrite)
         if self._kept:
-            shutil.rmtree(self._kept, ignore_errors=True)
+            delete(self._kept)
         return facts
 
     def print_tables(self, title: str, dataset: Any) -> None:
@@ -180,6 +181,7 @@ def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], cameras: Sequenc
     if len(set(outputs)) < len(outputs):
         raise SettingsError(f"{outputs[0]}: the page is written there; give the rows another name, such as {outputs[0].with_suffix('.json')}")
     read = [part for path in checkpoint for part in _parts(path)] + [file for folder in images for file in folder.glob("transforms*.json")]
+    read += cameras
     for output in outputs:
         refuse_output(output, overwrite, read, is_file=True)
         refuse_unwritable(output)
@@ -187,7 +189,7 @@ def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], cameras: Sequenc
 
 def _title(checkpoint: Sequence[Path], images: Sequence[Path], protocol: str, judged: Sequence[int]) -> str:
     """`judged`: the number of judged views of each checkpoint."""
-    views = f"{_listed(judged)} view{'' if [*judged] == [1] else 's'}"
+    views = plural(judged[0], "view") if len(judged) == 1 else f"{_listed(judged)} views"
     return f"{_listed(checkpoint)}; truth: {protocol} from {_listed(images)}, real dB over {views}"
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import base_cameras, print_facts, print_json
 from mipmap_plugin.commands.types import Cameras, Checkpoint, ScreenFilter, Up
-from mipmap_plugin.errors import PluginError
+from mipmap_plugin.errors import PluginError, plural
 from mipmap_plugin.jobs.base import COLORS
 from mipmap_plugin.process.garbage import uncollected
 from mipmap_plugin.progress import announced
@@ -125,7 +125,7 @@ def _verdict(wrapped: Wrapped, advice: str, health: Sequence[str], spoilt: bool,
     if spoilt:
         return "doubtful: read health before you adapt it"
     remarks = len(health)
-    noted = f", but {unseen}" if unseen else f", with {remarks} remark{'s' if remarks > 1 else ''} (health)" if remarks else ""
+    noted = f", but {unseen}" if unseen else f", with {plural(remarks, 'remark')} (health)" if remarks else ""
     scale = _adapted_to(wrapped)
     made = "" if scale is None else f", adapted to x{scale:g}, at which alone it looks right"
     return f"sound{made}{noted}; next: {advice}"

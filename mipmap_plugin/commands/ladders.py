@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 from mipmap_plugin.commands.common import print_json
 from mipmap_plugin.commands.pages import PAGE, look_at, write_levels_page
 from mipmap_plugin.commands.voice import say
-from mipmap_plugin.errors import MipmapPluginError, OutputError, SettingsError
+from mipmap_plugin.errors import MipmapPluginError, OutputError, SettingsError, plural
 from mipmap_plugin.formats.atomic import settled
+from mipmap_plugin.formats.here import size_in_bytes
 from mipmap_plugin.formats.splat_transform import LOD_META, refuse_exchange
 from mipmap_plugin.progress import announced
 
@@ -70,12 +71,14 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     from mipmap_plugin.levels.ladder import refuse_no_viewer
     from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
     from mipmap_plugin.levels.room import room_for
+    from mipmap_plugin.levels.store import is_of
     from mipmap_plugin.levels.streamed import SINGLE_LEVEL
     from mipmap_plugin.models.outputs import refuse_far
     from mipmap_plugin.models.places import state_path
     from mipmap_plugin.process import threads
 
     unfinished = settled(state_path(output))
+    overwrite = overwrite or is_of(unfinished, output)
     refuse_no_viewer(wrapped.model)
     refuse_ladder(output, wrapped, overwrite=overwrite)
     with announced("planning the levels"):
@@ -97,7 +100,7 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
         with threads.limited_for(wrapped.backend()[0], wrapped.threads):
             files = exports.write(folder, ladder.contents)
     except (KeyboardInterrupt, MipmapPluginError) as error:
-        again = f"{folder} has the levels, and the same command with --overwrite goes on from these"
+        again = f"{folder} has the levels, and the same command goes on from these"
         raise type(error)(f"{str(error) or 'interrupted'}; {again}") from error
     ladder.forget()
     return read_manifest(folder), files
@@ -163,7 +166,7 @@ def _left_out(manifest: dict[str, Any]) -> list[str]:
 
 
 def _zooms(folder: Path, manifest: dict[str, Any]) -> list[str]:
-    lines = [f"{folder}, for {manifest['viewer']}: {_counted(manifest)}"]
+    lines = [f"{folder}, for {manifest['viewer']}: {plural(len(manifest['levels']), 'level')}"]
     for level in manifest["levels"]:
         ends = {"down to": level["shown_from"], "up to": level["shown_to"]}
         shown = ", ".join(f"{word} x{zoom:.3g}" for word, zoom in ends.items() if zoom is not None) or "at every zoom"
@@ -173,7 +176,7 @@ def _zooms(folder: Path, manifest: dict[str, Any]) -> list[str]:
 
 
 def _distances(folder: Path, manifest: dict[str, Any]) -> list[str]:
-    lines = [f"{folder}, for {manifest['viewer']}: {_counted(manifest)} by distance"]
+    lines = [f"{folder}, for {manifest['viewer']}: {plural(len(manifest['levels']), 'level')} by distance"]
     for level in manifest["levels"]:
         ends = {"from": level["distance_from"] or None, "to": level["distance_to"]}
         shown = " ".join(f"{word} {distance:.3g}" for word, distance in ends.items() if distance is not None) or "everywhere"
@@ -182,11 +185,5 @@ def _distances(folder: Path, manifest: dict[str, Any]) -> list[str]:
     return [*lines, f"  distances in world units on a canvas of {manifest['canvas']} px: {rule}"]
 
 
-def _counted(manifest: dict[str, Any]) -> str:
-    count = len(manifest["levels"])
-    return f"{count} level{'s' * (count > 1)}"
-
-
 def _size(level: dict[str, Any]) -> str:
-    size = f"{level['bytes'] / 1e6:,.1f} MB" if level["bytes"] >= 1e6 else f"{level['bytes'] / 1e3:.0f} kB"
-    return f"{level['splats']:,} splats, {size}, {level['seconds']:.0f} s"
+    return f"{plural(level['splats'], 'splat')}, {size_in_bytes(level['bytes'])}, {level['seconds']:.0f} s"

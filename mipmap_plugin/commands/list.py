@@ -16,6 +16,9 @@ from mipmap_plugin.process.garbage import uncollected
 if TYPE_CHECKING:
     from mipmap_plugin.registry import Registry
 
+# The groups of entry points that registries read, behind "mipmap_plugin."; a registry itself is not asked, which may import torch.
+GROUPS = ("backends", "models", "recipes", "upsamplers", "viewers")
+
 Kind = Literal["families", "recipes", "viewers", "backends", "upsamplers"]
 
 
@@ -26,8 +29,7 @@ def list_(kinds: tyro.conf.Positional[tuple[Kind, ...]] = (), json: bool = False
         kinds: Only these; families and recipes are listed at once, the others after a moment.
         json: Print JSON.
     """
-    if not kinds:
-        _warn_of_other_groups()
+    warn_of_other_groups()
     if json:
         return print_json({each: _facts(each) for each in kinds or KINDS})
     for each in kinds or KINDS:
@@ -37,11 +39,9 @@ def list_(kinds: tyro.conf.Positional[tuple[Kind, ...]] = (), json: bool = False
         print_facts({each: [", ".join(facts["built in"]), *refused, *added]})
 
 
-def _warn_of_other_groups() -> None:
+def warn_of_other_groups() -> None:
     """Warn of packages whose entry points are in a group that nothing reads, as where its name is misspelled."""
-    with uncollected():
-        known = sorted(find()[0].group for find in KINDS.values())
-    points = entry_points()
+    known, points = [f"mipmap_plugin.{kinds}" for kinds in GROUPS], entry_points()
     for group in sorted(points.groups):
         if group.startswith("mipmap_plugin.") and group not in known:
             names = ", ".join(sorted({f"{point.name} ({point.value})" for point in points.select(group=group)}))

@@ -12,7 +12,7 @@ from typing import Any
 from mipmap_plugin.commands.common import print_json
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.voice import say
-from mipmap_plugin.errors import JobsFailed, SettingsError, install
+from mipmap_plugin.errors import JobsFailed, SettingsError, install, plural
 from mipmap_plugin.formats.here import from_here
 from mipmap_plugin.formats.staging import missing_folders, remove_empty
 from mipmap_plugin.jobs.base import Base
@@ -86,7 +86,7 @@ def adapt_many(many: Many, given: Sequence[Path], request: Request, base: Base, 
         remove_empty(sorted(missing, key=lambda folder: len(folder.parts), reverse=True))
     _print(outcomes, jobs, json)
     if failed := [outcome for outcome in outcomes if outcome.status != "done" and outcome.status != "finished before"]:
-        raise JobsFailed(f"{len(failed)} of {len(jobs)} jobs failed; the same command does these again, and no other")
+        raise JobsFailed(f"{len(failed)} of {plural(len(jobs), 'job')} failed; the same command does these again, and no other")
 
 
 def make_jobs(many: Many, given: Sequence[Path], request: Request, base: Base) -> list[Job]:
@@ -103,10 +103,10 @@ def jobs_of(checkpoint: Path, request: Request, base: Base, *, several: bool) ->
     """The job of one checkpoint for each scale and viewer. `several`: the output is a folder for all."""
     own = replace(base, checkpoint=checkpoint.absolute(), cameras=_of_scene(base.cameras, checkpoint))
     settings, images = dict(request.settings), _of_scene(request.images, checkpoint)
-    recipe, jobs = settings.pop("recipe"), []
+    recipe, network, jobs = settings.pop("recipe"), Path(settings.get("upsampler", "")).absolute(), []
     for scale, viewer in request.targets:
         target = adapted_path(checkpoint, request.output, scale, viewer, several=several).absolute()
-        jobs.append(Job(own, target, scale, viewer, recipe, settings, images, request.overwrite))
+        jobs.append(Job(own, target, scale, viewer, recipe, settings, images, request.overwrite, network if network.is_file() else None))
     return jobs
 
 
@@ -158,12 +158,15 @@ def _refuse(jobs: Sequence[Job]) -> None:
     for job in jobs:
         job.config()
         if job.overwrite and (base := bases.get(job.target.resolve())):
-            raise SettingsError(f"{job.target} holds a checkpoint that is to be adapted too ({base}); choose another --output")
+            raise SettingsError(f"{from_here(job.target)} holds a checkpoint that is to be adapted too ({from_here(base)}); choose another --output")
         if job.viewer is not None:
             viewers_for(job.viewer)
         if (other := makers.setdefault(job.target, job)) is not job:
-            both = f"{other.base.checkpoint} and {job.base.checkpoint}"
-            raise SettingsError(f"{both} would both be written to {job.target}; leave --output out, or adapt them one by one")
+            one, two = (from_here(each.base.checkpoint) for each in (other, job))
+            both, remedy = f"{one} and {two}", "leave --output out"
+            if one == two:
+                both, remedy = f"two scales of {one}", "give scales that differ more"
+            raise SettingsError(f"{both} would both be written to {from_here(job.target)}; {remedy}, or adapt them one by one")
 
 
 def _part(text: str | None) -> tuple[int, int]:

@@ -23,9 +23,14 @@ def adapted_path(checkpoint: Path, output: Path | None, scale: float, viewer: st
     name = adapted_name(checkpoint, scale, viewer)
     if output is None:
         return checkpoint.resolve().parent / name
-    if several and output.name.lower().endswith((".ply", *WRITTEN)):
+    return folder_of_several(output, (".ply", *WRITTEN)) / name if several else output
+
+
+def folder_of_several(output: Path, endings: tuple[str, ...]) -> Path:
+    """The folder `output`. Raises SettingsError where there is none and it has the ending of a file that it would hold."""
+    if output.name.lower().endswith(endings) and not output.is_dir():
         raise SettingsError(f"{output}: several files are written there; give the path of a folder")
-    return output / name if several else output
+    return output
 
 
 def picture_names(views: Sequence[Camera]) -> list[str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import this_command
+from mipmap_plugin.errors import plural
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
 from mipmap_plugin.formats.here import from_here
 
@@ -42,7 +43,7 @@ def evaluation_gallery(base: Wrapped, protocol: str, judged: int, recipes: Seque
     """What keeps the pictures of an evaluation by `judged` photographs."""
     from mipmap_plugin.pages.gallery import Gallery
 
-    return Gallery(base, f"photographs, protocol {protocol}, {judged} view{'s' if judged > 1 else ''}", recipes)
+    return Gallery(base, f"photographs, protocol {protocol}, {plural(judged, 'view')}", recipes)
 
 
 def write_evaluation_page(

@@ -14,7 +14,7 @@ from mipmap_plugin.commands.common import base_cameras, wrap
 from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, OwnScale, Up
 from mipmap_plugin.commands.voice import say
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, plural
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.progress import counted
@@ -83,7 +83,7 @@ def render(
     options: RenderOptions = {"viewer": viewer, "filter_3d": filter_3d, "outputs": outputs, "exposure": exposure, "clamped": not exposure}
     for camera, picture in counted(zip(views, pictures, strict=True), len(views), "rendering", "view"):
         _write(picture, wrapped.render(camera.zoomed(zoom), zoom, filter_name, supersampling, **options), outputs, overwrite)
-    count = f"{len(views)} picture{'s' if len(views) > 1 else ''}"
+    count = plural(len(views), "picture")
     say(f"{count} in {output}{_told_by_file(zoom if scale is None else 1.0, own_viewer)}")
     if not wrapped.cameras:
         say(f"seen from a generated orbit, {wrapped.viewpoints.orbit.told()}; --cameras gives the scene's own cameras")

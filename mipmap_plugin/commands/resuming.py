@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, plural
+from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.progress import note
 
 # The name of a cell's file, or of the folder in which it is written.
@@ -25,21 +26,17 @@ def resumable(folder: Path | None, unit: str) -> Iterator[None]:
 
     Raises SettingsError for a folder with other things in it, because it is deleted at the end.
     """
-    if folder is not None and folder.exists() and not (folder.is_dir() and all(CELL.fullmatch(path.name) for path in folder.iterdir())):
+    if folder is not None and settled(folder).exists() and not (folder.is_dir() and all(CELL.fullmatch(path.name) for path in folder.iterdir())):
         raise SettingsError(f"{folder} is needed for what is finished, but is or holds something else; move it, or choose another output")
     if found := _cells(folder):
-        note(f"{folder} has {_counted(found, unit)} of a command that was interrupted; those of the same request are not measured again")
+        note(f"{folder} has {plural(found, unit)} of a command that was interrupted; those of the same request are not measured again")
     try:
         yield
     except KeyboardInterrupt as interrupt:
         if folder is None:
             raise KeyboardInterrupt("interrupted; nothing was kept, because neither an output nor a page was to be written") from interrupt
-        raise KeyboardInterrupt(f"interrupted with {_counted(_cells(folder), unit)} finished; run the same command again to go on") from interrupt
+        raise KeyboardInterrupt(f"interrupted with {plural(_cells(folder), unit)} finished; run the same command again to go on") from interrupt
 
 
 def _cells(folder: Path | None) -> int:
     return len(list(folder.glob("*.pt"))) if folder else 0
-
-
-def _counted(count: int, unit: str) -> str:
-    return f"{count} {unit}{'' if count == 1 else 's'}"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from mipmap_plugin.commands.common import print_json
 from mipmap_plugin.commands.many import Many, Request, engine, finished_before, jobs_of
 from mipmap_plugin.commands.voice import detail, say
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, plural
 from mipmap_plugin.formats.here import from_here
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job, Outcome
@@ -52,6 +52,6 @@ def _say(job: Job, tiles: int, joined: Joined) -> None:
     report = joined.report
     splats = f"{report.gaussians_before:,} -> {report.gaussians_after:,} splats"
     viewer = f" in {job.viewer}" if job.viewer else ""
-    say(f"x{job.scale:g}{viewer}, {tiles} tiles: {report.gain()}, {splats}, {report.seconds['total']:.1f} s")
+    say(f"x{job.scale:g}{viewer}, {plural(tiles, 'tile')}: {report.gain()}, {splats}, {report.seconds['total']:.1f} s")
     say(from_here(joined.file))
     detail(f"  holds {report.returned}; {report.views}; {report.filters}; backend {report.backend}")

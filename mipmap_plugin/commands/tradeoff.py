@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from mipmap_plugin.commands.common import print_json, scene, without_none, wrap
+from mipmap_plugin.commands.outputs import folder_of_several
 from mipmap_plugin.commands.pages import look_at, tradeoff_page_path, write_tradeoff_page
 from mipmap_plugin.commands.resuming import resumable
 from mipmap_plugin.commands.types import Background, Cameras, Checkpoint, Scales, ScreenFilter, Up, unique_scales
@@ -75,7 +76,7 @@ def tradeoff(
     from mipmap_plugin.evaluation.tradeoff.files import KEPT, Folder, refuse
     from mipmap_plugin.evaluation.tradeoff.points import Plan
     from mipmap_plugin.evaluation.tradeoff.run import run
-    refuse(folder := Folder(output, picture, overwrite))
+    refuse(folder := Folder(folder_of_several(output, (".json", ".csv", ".png", ".html")), picture, overwrite))
     page = tradeoff_page_path(output, overwrite) if report else None
     plan = Plan(recipe or ("default", "paper"), steps, backend or ("auto",), supersampling or (2, 4, 8), renderers, repeats, seed, viewer)
     base = Base(checkpoint, cameras, background, screen_filter=screen_filter, up=up)

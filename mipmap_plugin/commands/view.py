@@ -72,7 +72,8 @@ def view(
         name = checkpoint.resolve().name
         page = _page(wrapped, adapted, backend, PageSettings(host, port, name, *_choices(wrapped, viewer), _free(checkpoint, output)))
         try:
-            say(f"{page.address} shows {name}; Ctrl-C ends it")
+            taken = "" if port == 0 or page.address.endswith(f":{port}") else f" (port {port} is taken)"
+            say(f"{page.address} shows {name}{taken}; Ctrl-C ends it")
             if place := base_cameras(wrapped, cameras):
                 say(f"its views are those of its base, in {place}; --cameras gives others")
             if browser and has_display():

@@ -132,15 +132,34 @@ def speaking(quiet: bool, log: Path | None) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def alone() -> Iterator[None]:
-    """Inside the block only `put` prints to standard output, which may be JSON: what plug-ins and libraries print goes to standard error."""
+def alone(*, json: bool = False) -> Iterator[None]:
+    """Inside the block only `put` prints to standard output: what plug-ins and libraries print goes to standard error. `json`: also what they
+    print past Python, as processes do that they start."""
     voice = VOICE.get()
-    token = VOICE.set(replace(voice, stdout=voice.out))
+    with _on_its_own_descriptor(voice.out) if json else contextlib.nullcontext(voice.out) as out:
+        token = VOICE.set(replace(voice, stdout=out))
+        try:
+            with contextlib.redirect_stdout(sys.stderr):
+                yield
+        finally:
+            VOICE.reset(token)
+
+
+@contextlib.contextmanager
+def _on_its_own_descriptor(stream: TextIO) -> Iterator[TextIO]:
+    """A stream that prints where `stream` does, whose descriptor leads to standard error inside the block."""
     try:
-        with contextlib.redirect_stdout(sys.stderr):
-            yield
-    finally:
-        VOICE.reset(token)
+        number, other = stream.fileno(), sys.stderr.fileno()
+    except (OSError, ValueError):  # no file, as where a test reads it
+        yield stream
+        return
+    stream.flush()
+    with os.fdopen(os.dup(number), "w", encoding=stream.encoding, errors=stream.errors) as own:
+        os.dup2(other, number)
+        try:
+            yield own
+        finally:
+            os.dup2(own.fileno(), number)
 
 
 class _NoTerminal:

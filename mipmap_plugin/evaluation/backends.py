@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from itertools import product
 
 import torch
-from tqdm import tqdm
 
 from mipmap_plugin.backends import get_backend, note_of, survey
 from mipmap_plugin.backends.base import Needs
@@ -16,6 +15,7 @@ from mipmap_plugin.backends.conformance import CASES, MORE, Outcome, check_backe
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.evaluation.report import markdown
 from mipmap_plugin.process import threads
+from mipmap_plugin.progress import Bar
 
 # Reasons that are told beside the table of cases: the most frequent.
 REASONS = 5
@@ -46,7 +46,7 @@ def check(name: str, *, full: bool = False) -> list[Outcome]:
     cases = {**CASES, **MORE} if full else CASES
     with threads.limited(1, shared=False):  # four times as fast as two for images this small
         for device, dtype in product(_devices(), (torch.float32, torch.float64)):
-            progress = tqdm(cases.items(), disable=None, desc=f"checking {name} on {device}", unit="case")
+            progress = Bar(cases.items(), desc=f"checking {name} on {device}", unit="case")
             outcomes = [outcome for case, build in progress for outcome in check_backend(backend, {case: build}, dtype=dtype, device=device)]
             if not all(outcome.skipped for outcome in outcomes):
                 return outcomes

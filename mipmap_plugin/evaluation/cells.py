@@ -7,14 +7,21 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.adaptation.report import versions
+from mipmap_plugin.adaptation.target.upsamplers import network_input
+from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.formats.atomic import delete
 from mipmap_plugin.formats.torch_file import load_torch, save_torch
+
+
+def made_by(config: AdaptConfig) -> dict[str, Any]:
+    """The settings of an adaptation for a cell's key, with a hash of the network that they name by its path."""
+    return config.model_dump() | network_input(config.upsampler)
 
 
 class Cells:
@@ -38,7 +45,7 @@ class Cells:
     def remove(self) -> None:
         """Delete the folder, when everything is written elsewhere."""
         if self.folder is not None:
-            shutil.rmtree(self.folder, ignore_errors=True)
+            delete(self.folder)
 
     def keep(self, key: Mapping[str, Any], content: dict[str, Any]) -> None:
         """Write a finished cell, of tensors and plain values, atomically. Raises OutputError."""

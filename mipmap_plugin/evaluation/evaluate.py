@@ -11,12 +11,12 @@ from statistics import fmean
 from typing import Any
 
 import torch
-from tqdm import tqdm
 
 from mipmap_plugin.adaptation.adapted import Adapted
+from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError, unknown
-from mipmap_plugin.evaluation.cells import Cells
+from mipmap_plugin.evaluation.cells import Cells, made_by
 from mipmap_plugin.evaluation.measure import (
     FILTERS,
     Baseline,
@@ -34,6 +34,7 @@ from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.photographs import digest_of_image
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, not_held_out, views_of_placed
 from mipmap_plugin.evaluation.shots import Recorder, Shot, Watcher
+from mipmap_plugin.progress import Bar
 from mipmap_plugin.recipes import most_steps
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
@@ -91,7 +92,7 @@ class Evaluator:
         """The mean quality of `show(camera at the base scale)` over the views. PSNRs of views are averaged, as in the literature."""
         psnrs, similarities, distances = [], [], []
         watch = warm_stopwatch(show, self.views[0].camera)
-        for view in tqdm(self.views, disable=None, desc=f"{name} x{scale:g}", leave=False):
+        for view in Bar(self.views, desc=f"{name} x{scale:g}", leave=False):
             with torch.no_grad(), watch:
                 image = show(view.camera)
             image, truth = self.protocol.as_saved(image), view.truth(scale, self.protocol).to(image)
@@ -122,9 +123,11 @@ def training_free_rows(
     found = baselines(model, scale, judge.protocol.shrink_by, filters=filters, upsampler=upsampler)
     in_viewers = [base_in_viewer(name, model, scale) for name in viewers_for(viewer)] if viewer else []
 
+    network = network_input(upsampler)
+
     def row(baseline: Baseline) -> Row:
         name, render, count = baseline.name, baseline.render, baseline.gaussians
-        return judge.cell({"row": name, "scale": scale}, lambda judge: judge.row(name, scale, render, gaussians=count))
+        return judge.cell({"row": name, "scale": scale} | network, lambda judge: judge.row(name, scale, render, gaussians=count))
 
     return [row(baseline) for baseline in found] + worst([row(baseline) for baseline in in_viewers])
 
@@ -209,7 +212,7 @@ def _adapted_rows(model: Wrapped, judge: Evaluator, scale: float, recipes: Seque
         adapted = adapt_alone(model, scale, recipe=name, **own)
         return adapted_row(f"{name}, {'scored' if on == 'scored' else _unseen(judge.views, adapted)}", adapted, judge)
 
-    made = {name: config_of(name, scale, settings).model_dump() for name in recipes}  # a registered recipe may have been edited since
+    made = {name: made_by(config_of(name, scale, settings)) for name in recipes}  # a registered recipe may have been edited since
     each = product(recipes, ("train", "scored"))
     return [judge.cell({"recipe": name, "made": made[name], "on": on, "scale": scale}, partial(row, name, on)) for name, on in each]
 

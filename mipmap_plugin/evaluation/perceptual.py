@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from contextlib import redirect_stdout
-from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Literal
@@ -78,8 +76,7 @@ def _load(backbone: str, file: Path | None) -> nn.Module:
 
 def _download(backbone: str) -> dict[str, Tensor]:
     try:
-        # What torch prints of a download is kept from the standard output, which may be JSON.
-        with announced(f"downloading the weights of {backbone}"), redirect_stdout(StringIO()):
+        with announced(f"downloading the weights of {backbone}"):
             return torch.hub.load_state_dict_from_url(DOWNLOADS[backbone], map_location="cpu", progress=False, weights_only=True, check_hash=True)
     except OSError as error:
         advice = f"download {DOWNLOADS[backbone]} elsewhere and give the file (--lpips-weights)"

@@ -7,6 +7,7 @@ from statistics import fmean
 import torch
 
 from mipmap_plugin.camera import evenly
+from mipmap_plugin.errors import plural
 from mipmap_plugin.evaluation.metrics import SAME_DB, psnr
 from mipmap_plugin.models.adapted_scale import adapted_scale
 from mipmap_plugin.models.base import why_no_viewer
@@ -36,11 +37,11 @@ def viewer_differences(wrapped: Wrapped) -> str:
         return "not drawn: only the reference backend can, which takes too long; `mipmap-plugin backends` says what others lack"
     view_count = min(VIEWS, len(views), SPLATS // max(1, count), PIXELS // pixels)
     if view_count == 0:
-        return f"not drawn: {count:,} splats on {pixels:,} pixels take too long; `mipmap-plugin render --viewer NAME` draws them"
+        return f"not drawn: {plural(count, 'splat')} on {plural(pixels, 'pixel')} take too long; `mipmap-plugin render --viewer NAME` draws them"
     chosen = evenly(views, view_count)
     truths = [wrapped.render(view, scale).image for view in chosen]
     parts = []
     for viewer in VIEWERS:
         mean_psnr = fmean(psnr(wrapped.render(view, scale, viewer=viewer).image, truth) for view, truth in zip(chosen, truths, strict=True))
         parts.append(f"{viewer} {'the same' if mean_psnr == SAME_DB else f'{mean_psnr:.1f} dB'}")
-    return f"{', '.join(parts)}, compared with its training, at x{scale:g} in {view_count} view{'s' if view_count > 1 else ''}"
+    return f"{', '.join(parts)}, compared with its training, at x{scale:g} in {plural(view_count, 'view')}"

@@ -63,6 +63,12 @@ def before_binary(document: dict[str, Any], size: int) -> bytes:
     return head + struct.pack("<I4s", len(text), JSON_CHUNK) + text + struct.pack("<I4s", size, BINARY_CHUNK)
 
 
+def bytes_before_binary(path: Path) -> int:
+    """The length of what `before_binary` wrote into a file."""
+    with path.open("rb") as file:
+        return 12 + 8 + int(struct.unpack("<12xI", file.read(16))[0]) + 8
+
+
 def _document(named: Mapping[str, np.ndarray], mode: str | None) -> dict[str, Any]:
     """The JSON of one mesh with these attributes, whose bytes follow one another, and of how it is to be drawn."""
     starts = np.cumsum([0, *(array.nbytes for array in named.values())]).tolist()

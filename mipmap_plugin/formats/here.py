@@ -1,10 +1,21 @@
-"""Paths as people are told them."""
+"""Paths and sizes as people are told them."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 
 def from_here(path: Path) -> str:
     """A path from the current directory if it lies in it; any other as it is."""
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
+
+
+def told_from_here(text: str) -> str:
+    """A text whose paths, as jobs have them, are told as `from_here` tells them."""
+    return re.sub(rf"(?<![^\s'\"(]){re.escape(str(Path.cwd()))}/", "", text)
+
+
+def size_in_bytes(count: int) -> str:
+    """A size in kB or MB."""
+    return f"{count / 1e6:,.1f} MB" if count >= 1e6 else f"{count / 1e3:.0f} kB"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.formats.here import from_here
+from mipmap_plugin.formats.here import from_here, told_from_here
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.recipes import recipe
 
@@ -26,6 +26,7 @@ class Job:
     settings: dict[str, Any] = field(default_factory=dict)  # that override those of the recipe: seed, steps, ...
     images: Path | None = None  # a scene whose photographs are the truth of a zoom-in
     overwrite: bool = False
+    network: Path | None = None  # where the network's file lies that the settings name as `upsampler`
     skip_finished: bool = True  # do nothing if the target was made from the same base with the same settings
 
     needs_folder: ClassVar[str] = ""  # why the files of such a job cannot be sent, in a sentence
@@ -57,4 +58,4 @@ class Outcome:
 
     def __str__(self) -> str:
         said = self.reason if self.reason.startswith(self.status) else ", ".join(filter(None, (self.status, self.reason)))
-        return f"{self.job}: {said}"
+        return f"{self.job}: {told_from_here(said)}"

@@ -20,7 +20,7 @@ from mipmap_plugin.models.zipped_folder import opened
 from mipmap_plugin.scenes import OPTIONS, load_scene
 
 # Folders of an unpacked parcel.
-BASE, CAMERAS, IMAGES, OUTPUT = Path("base"), Path("cameras"), Path("images"), Path("output")
+BASE, CAMERAS, IMAGES, NETWORK, OUTPUT = (Path(name) for name in ("base", "cameras", "images", "network", "output"))
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Delivery:
 
 
 def pack(job: Job) -> Parcel:
-    """Pack the checkpoint of a job, its cameras and photographs, and the state of its run, if it was interrupted.
+    """Pack the checkpoint of a job, its cameras, photographs and network, and the state of its run, if it was interrupted.
 
     Raises CheckpointError, SceneError, SettingsError, OutputExists, OutputError, OSError.
     """
@@ -56,10 +56,13 @@ def pack(job: Job) -> Parcel:
     members = {BASE / part.relative_to(folder): part for part in parts}
     members |= {} if base.cameras is None else _scene(base.cameras, CAMERAS)
     members |= {} if job.images is None else _photographs(job.images, IMAGES)
+    network = job.network and NETWORK / job.network.name
+    members |= {network: job.network} if network and job.network else {}
     members |= {OUTPUT / state.name: state for state in _states(job.target) if state.is_file()}
     sent = replace(base, checkpoint=BASE / base.checkpoint.relative_to(folder), cameras=base.cameras and _packed(base.cameras, CAMERAS))
     target = OUTPUT / named(job.target).name
-    return Parcel(replace(job, base=sent, target=target, images=job.images and _packed(job.images, IMAGES)), _archive(members))
+    images = job.images and _packed(job.images, IMAGES)
+    return Parcel(replace(job, base=sent, target=target, images=images, network=network), _archive(members))
 
 
 def do_parcel(parcel: Parcel, do: Callable[[Job], Outcome]) -> Delivery:
@@ -70,7 +73,8 @@ def do_parcel(parcel: Parcel, do: Callable[[Job], Outcome]) -> Delivery:
             archive.extractall(place, filter="data")
         (place / OUTPUT).mkdir(exist_ok=True)
         base = replace(job.base, checkpoint=place / job.base.checkpoint, cameras=job.base.cameras and place / job.base.cameras)
-        outcome = do(replace(job, base=base, target=place / job.target, images=job.images and place / job.images))
+        images, network = job.images and place / job.images, job.network and place / job.network
+        outcome = do(replace(job, base=base, target=place / job.target, images=images, network=network))
         kept = {"done": (place / OUTPUT).rglob("*"), "interrupted": _states(place / job.target)}.get(outcome.status, [])
         written = [file for file in kept if file.is_file()]
         file = outcome.file and outcome.file.relative_to(place / OUTPUT)

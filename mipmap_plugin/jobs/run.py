@@ -6,6 +6,7 @@ import time
 import traceback
 from dataclasses import replace
 
+from mipmap_plugin.adaptation.target.upsamplers import placed
 from mipmap_plugin.errors import MipmapPluginError, OutputExists, of_a_file
 from mipmap_plugin.jobs.finished import finished
 from mipmap_plugin.jobs.job import Job, Outcome
@@ -17,7 +18,8 @@ from mipmap_plugin.models.zipped_folder import told
 def run(job: Job, threads: int | None = None) -> Outcome:
     """Do a job; what is wrong with it becomes its outcome. An interrupted job raises KeyboardInterrupt, and continues when it is run again."""
     began = time.perf_counter()
-    outcome = _attempt(job, threads)
+    with placed(job.settings.get("upsampler", ""), job.network):
+        outcome = _attempt(job, threads)
     return replace(outcome, seconds=time.perf_counter() - began)
 
 

@@ -6,7 +6,8 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from mipmap_plugin.formats.here import from_here
+from mipmap_plugin.errors import plural
+from mipmap_plugin.formats.here import from_here, told_from_here
 from mipmap_plugin.jobs.job import Job, Outcome
 
 COLUMNS = ("checkpoint", "scale", "viewer", "outcome", "splats", "dB", "seconds", "file, or what is wrong")
@@ -44,7 +45,7 @@ def _psnr(report: dict[str, Any]) -> str:
 
 
 def _last(outcome: Outcome) -> str:
-    return from_here(outcome.file) if outcome.file else outcome.reason
+    return from_here(outcome.file) if outcome.file else told_from_here(outcome.reason)
 
 
 def totals(outcomes: Sequence[Outcome], count: int) -> str:
@@ -52,7 +53,7 @@ def totals(outcomes: Sequence[Outcome], count: int) -> str:
     statuses = Counter(outcome.status for outcome in outcomes)
     waiting = count - sum(statuses.values())
     parts = [f"{number} {status}" for status, number in statuses.items()] + ([f"{waiting} not begun"] if waiting else [])
-    return f"{count} job{'s' if count != 1 else ''}: {', '.join(parts) or 'none begun'}"
+    return f"{plural(count, 'job')}: {', '.join(parts) or 'none begun'}"
 
 
 def facts(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:

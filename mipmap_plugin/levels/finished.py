@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.adaptation.adapted import Adapted
+from mipmap_plugin.errors import plural
 from mipmap_plugin.levels.contents import Contents, Level
 from mipmap_plugin.levels.distance.manifest import Contents as DistanceContents
 from mipmap_plugin.levels.store import LevelStore
@@ -24,7 +25,7 @@ class Ladder:
     _write: Callable[[Any, Path, bool], Path]  # contents, folder, whether to overwrite
 
     def __repr__(self) -> str:
-        return f"<Ladder: {len(self.levels)} levels>"
+        return f"<Ladder: {plural(len(self.levels), 'level')}>"
 
     @property
     def levels(self) -> list[Level] | list[Adapted]:
@@ -38,8 +39,7 @@ class Ladder:
         `keep_resume`: leave what was kept to go on from until `forget`.
         """
         saved = self._write(self.contents, path_of(folder), overwrite)
-        if not keep_resume:
-            self.forget()
+        self._store.note(saved) if keep_resume else self.forget()
         return saved
 
     def forget(self) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 from mipmap_plugin.adaptation.report import provenance, versions
 from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.errors import TEMPORARY, MipmapPluginError, SettingsError
+from mipmap_plugin.formats.glb import bytes_before_binary
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import WRITTEN
 from mipmap_plugin.frozen_base import FrozenBase
@@ -29,9 +30,9 @@ SIZE = re.compile(r"([0-9.]+)\s*([a-z]*)", re.IGNORECASE)
 # Compressed files have a few percent more bytes per splat where splats are fewer.
 COMPRESSED_MARGIN = 0.9
 
-# Bytes that a PLY's header may have beyond what is known of it before the run: digits of the scale and of settings that follow from it, the name of
-# the filter that fits, the hash of photographs, the tag of the viewer's filter and its dilation. All together they have 214 at most, and a splat
-# has 68 to 248.
+# Bytes that the head of a PLY may have beyond what is known of it before the run: digits of the scale and of settings that follow from it, the name
+# of the filter that fits, the hash of photographs, the tag of the viewer's filter and its dilation. All together they have 214 at most, those of a
+# GLB's fewer (digits of its bounds, and how it is drawn), and a splat has 68 to 248.
 UNKNOWN = 256
 
 # Bytes kept for what a file of another project has besides its splats: a torch archive's own, and comments.
@@ -90,14 +91,21 @@ def splats_within(model: SplatModel, size: int, name: str, record: dict[str, Any
                 own = contract.save(for_loader_of(record.get("viewer"), model, every), every, record)
         except MipmapPluginError as error:
             raise type(error)(str(error).replace(str(every), name)) from error
-        besides, all_of_them = read_header(own).body if own.suffix == ".ply" else 0, own.stat().st_size
-    if own.suffix == ".ply":
+        besides, all_of_them = _besides(own), own.stat().st_size
+    if besides:
         fitting = (size - besides - UNKNOWN) * count // (all_of_them - besides)
     else:
         fitting = int((COMPRESSED_MARGIN * size if ending in WRITTEN else size - ARCHIVE) * count / all_of_them)
     if fitting < 1:
         raise SettingsError(f"bytes: {size:,} bytes hold no splat of this checkpoint and a header; allow more")
     return min(count, fitting)
+
+
+def _besides(file: Path) -> int:
+    """Bytes that a file has besides its splats, of which each takes as many; 0 if that is not known."""
+    if file.suffix == ".ply":
+        return read_header(file).body
+    return bytes_before_binary(file) if file.suffix == ".glb" else 0
 
 
 def fitting_scale(splats: int, model: SplatModel) -> float:

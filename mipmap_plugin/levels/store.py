@@ -14,17 +14,20 @@ from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.report import Report, versions
 from mipmap_plugin.camera import digest_of
 from mipmap_plugin.errors import MipmapPluginError, SettingsError, brief
-from mipmap_plugin.formats.atomic import delete, json_text, refuse_unwritable, settled, write_json
+from mipmap_plugin.formats.atomic import delete, json_text, refuse_unwritable, settled, sha256, write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import Filtered, SplatModel, digest_of_model
-from mipmap_plugin.models.places import REPORT, STATE, state_path
+from mipmap_plugin.models.places import MANIFEST, REPORT, STATE, state_path
 from mipmap_plugin.progress import announced
 
 # Written before the first level: what was broken off earlier leaves the state of a run at most.
 REQUEST = "request.json"
+
+# Written once the ladder is, which further files may still be made from.
+OUTCOME = "written.json"
 
 # The name of a run's state, or of the lock beside it.
 IS_STATE = re.compile(rf"\.?level_.*{re.escape(STATE)}.*").fullmatch
@@ -68,6 +71,11 @@ class LevelStore:
         with announced(f"reading {file.name}"):
             return self._loaded(file)
 
+    def note(self, written: Path) -> None:
+        """Keep which ladder was `written` of the levels, so that the same command may replace it (`is_of`)."""
+        if self._folder is not None:
+            write_json(self._folder / OUTCOME, {MANIFEST: sha256(written / MANIFEST)}, overwrite=True)
+
     def remove(self) -> None:
         """Delete the folder, whose levels have been saved elsewhere."""
         if self._folder is not None:
@@ -87,6 +95,14 @@ class LevelStore:
         model.trained = self._base.trained.drawn_with(self._target)
         backend, _ = self._base.backend(viewer=report.viewer)
         return Adapted(model, report, backend, self._target, {str(report.viewer): self._target}, cameras=self._base.views())
+
+
+def is_of(unfinished: Path, ladder: Path) -> bool:
+    """Whether a ladder was written of the levels in the folder `unfinished`, and has not changed since."""
+    try:
+        return bool(read_json(unfinished / OUTCOME) == {MANIFEST: sha256(ladder / MANIFEST)})
+    except (MipmapPluginError, OSError):
+        return False
 
 
 def _facts(base: FrozenBase, request: LadderRequest) -> dict[str, Any]:

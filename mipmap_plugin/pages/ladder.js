@@ -51,8 +51,10 @@ function ladderChart(ladder) {
     make("p", { class: "note" }, ladder.measured));
 }
 
+const size = (bytes) => (bytes < 1e6 ? `${digits(bytes / 1e3, 0)} kB` : `${digits(bytes / 1e6, 1)} MB`);
+
 const heldColumns = [
-  ["splats", (level) => grouped(level.splats), "number"], ["MB", (level) => digits(level.bytes / 1e6, 2), "number"],
+  ["splats", (level) => grouped(level.splats), "number"], ["size", (level) => size(level.bytes), "number"],
   ["s", (level) => digits(level.seconds, 0), "number"],
 ];
 

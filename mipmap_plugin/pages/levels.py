@@ -9,7 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mipmap_plugin.errors import plural
 from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.formats.here import size_in_bytes
 from mipmap_plugin.levels.contents import Contents
 from mipmap_plugin.levels.yardstick import VIEWS, Yardstick, shrunk
 from mipmap_plugin.pages.gallery import effects_of_base
@@ -70,9 +72,9 @@ def rounded(zoom: float) -> str:
 def lead(manifest: dict[str, Any], where: str) -> str:
     """What came out. `where`: what the curve is over."""
     levels, curve = manifest["levels"], manifest["curve"]
-    splats, megabytes = sum(level["splats"] for level in levels), sum(level["bytes"] for level in levels) / 1e6
+    splats, size = (sum(level[of] for level in levels) for of in ("splats", "bytes"))
     base = min(point["base_db"] for point in curve)
     return (
-        f"{len(levels)} level{'s' * (len(levels) > 1)} for {manifest['viewer']}, {splats:,} splats, {megabytes:.1f} MB: {where} at worst "
+        f"{plural(len(levels), 'level')} for {manifest['viewer']}, {plural(splats, 'splat')}, {size_in_bytes(size)}: {where} at worst "
         f"{manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} dB on average; the base alone falls to {base:.1f} dB."
     )

@@ -8,6 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.errors import plural
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.levels.distance.manifest import Contents
 from mipmap_plugin.levels.distance.walks import focal_of
@@ -46,4 +47,4 @@ def _zoom(ladder: Contents, view: Camera, seen: Seen, point: WalkPoint) -> Zoom:
 
 
 def _picture(name: str, role: Role, image: Tensor, seen: Seen, mean: float, splats: int) -> Picture:
-    return Picture(name, role, image, {"psnr_db": psnr(image, seen.truth)}, {"psnr_db": mean}, f"{splats:,} splats")
+    return Picture(name, role, image, {"psnr_db": psnr(image, seen.truth)}, {"psnr_db": mean}, plural(splats, "splat"))

@@ -12,6 +12,7 @@ from mipmap_plugin.adaptation.optimization.amount import fewer_note
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.report import Report, filters, simulated, versions
 from mipmap_plugin.adaptation.target.upsamplers import network_input
+from mipmap_plugin.errors import plural
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.models.mip import unread
 from mipmap_plugin.tiles.scene import TiledScene
@@ -44,14 +45,14 @@ def make_report(
         orbit=scene.viewpoints.orbit,
         settings=config,
         backend=scene.backend_note,
-        views=f"{scene.views.note}, in {len(files)} tiles",
+        views=f"{scene.views.note}, in {plural(len(files), 'tile')}",
         viewer=scene.viewer,
         filters=filters(scene.scale, config, scene.base_effects, [scene.target]),
         effects=simulated(model, scene.wrapped.any_camera(), [scene.target], config, scene.scale),
         gaussians_before=sum(map(len, scene.cores)),
         gaussians_after=after,
         seconds=seconds,
-        ended_by=_ended_by(scene, tiles, f"{len(files)} tiles of {steps} steps"),
+        ended_by=_ended_by(scene, tiles, f"{plural(len(files), 'tile')} of {plural(steps, 'step')}"),
         returned=returned,
         validation=validation,
         curve=[CurvePoint(step=steps, seconds=seconds["total"], psnr_db=None, validation_db=psnr, gaussians=after)],

@@ -18,6 +18,7 @@ from mipmap_plugin.adaptation.target.detail import unused_upsampler
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.errors import BackendUnavailable, JobsFailed, SceneError, SettingsError
 from mipmap_plugin.formats.atomic import delete, new_file, together, write_json
+from mipmap_plugin.formats.here import told_from_here
 from mipmap_plugin.formats.ply_rows import concatenate
 from mipmap_plugin.formats.tags import with_tags
 from mipmap_plugin.jobs.engines import in_this_process
@@ -217,7 +218,7 @@ def _done(jobs: Sequence[Job], engine: Engine, what: str) -> list[Outcome]:
     finally:
         running.close()
     if failed := [outcome for outcome in outcomes if outcome.status not in ("done", "finished before")]:
-        reasons = "; ".join(dict.fromkeys(outcome.reason for outcome in failed))
+        reasons = told_from_here("; ".join(dict.fromkeys(outcome.reason for outcome in failed)))
         raise JobsFailed(f"{len(failed)} of {len(jobs)} jobs ({what}) failed: {reasons}; the same command does these again, and no other")
     return outcomes
 

@@ -92,7 +92,7 @@ def test_adapting_in_a_thread():
     thread = threading.Thread(target=lambda: done.append(wrapped().adapt(1 / 4, steps=1, extra_views=0)))
     thread.start()
     thread.join()
-    assert done[0].report.ended_by == "1 steps"
+    assert done[0].report.ended_by == "1 step"
 
 
 def test_the_time_budget_ends_the_run():
@@ -112,7 +112,7 @@ def test_the_choice_that_is_reserved_for_is_not_told_as_the_start(monkeypatch):
 def test_steps_that_were_planned_for_a_time_budget_are_told(monkeypatch):
     monkeypatch.setattr(Pace, "of", classmethod(lambda *_: Pace(6e3, 0.0, 0.0)))
     report = wrapped().adapt(1 / 4, time_budget_s=1e4, **BRIEF).report
-    assert report.ended_by == "1 steps (planned for the time budget in place of 7)" and report.settings.steps == 7
+    assert report.ended_by == "1 step (planned for the time budget in place of 7)" and report.settings.steps == 7
 
 
 def test_the_knee_ends_the_run():

@@ -9,6 +9,7 @@ from commands_run import refused
 
 from mipmap_plugin import register_backend, registry
 from mipmap_plugin.backends.conformance import CASES, MORE, Outcome
+from mipmap_plugin.commands.list import GROUPS, KINDS
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation import backends as backends_module
 
@@ -83,6 +84,10 @@ def test_list_says_where_names_come_from_and_what_is_wrong_with_one(run, tmp_pat
     assert "kiosk: stranger:KIOSK of stranger 1.0, not used: upsampler 'kiosk' is of type tuple; make it a function" in out
     listed = json.loads(run("list", "recipes", "--json")[1])
     assert listed["recipes"]["of packages"] == {"brief": "stranger:brief of stranger 1.0"}
+
+
+def test_every_registry_reads_a_group_that_is_told():
+    assert sorted(find()[0].group for find in KINDS.values()) == [f"mipmap_plugin.{kinds}" for kinds in GROUPS]
 
 
 def test_no_backend_is_named_as_the_choice_of_one():

@@ -141,6 +141,17 @@ def test_words_that_are_not_understood_exit_with_2(run, words):
     assert code == 2 and "Traceback" not in err
 
 
+@pytest.mark.parametrize("words", ["levels base.ply --viewer spark --output new.ply", "tradeoff base.ply --scale 1/2 --output new.json --no-picture"])
+def test_the_folder_of_several_files_is_not_called_as_one_of_them(run, words):
+    refused(run(*words.split()), "several files are written there; give the path of a folder")
+
+
+@pytest.mark.parametrize("words", [["inspect", ""], ["adapt", "a.ply", "--scale", "1/4", "--output="], ["adapt", "a.ply", "--output", ""]])
+def test_an_empty_word_is_not_this_folder(run, words):
+    """As of a variable that is not set, in quotes: `Path("")` is the current folder."""
+    refused(run(*words), "a word of this command is empty")
+
+
 @pytest.mark.parametrize(("text", "scale"), [("1/4", 0.25), ("4", 4.0), ("1e-3", 0.001), ("1 / 4", 0.25), ("×1/4", 0.25), ("0.25x", 0.25)])
 def test_scales_are_fractions_or_numbers(text, scale):
     assert read_scale(text) == scale

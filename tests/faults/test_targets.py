@@ -261,7 +261,7 @@ def test_a_state_that_cannot_be_kept_costs_a_warning(tmp_path, monkeypatch):
     monkeypatch.setattr("mipmap_plugin.adaptation.optimization.resume.claim_state_file", refused)
     model = wrap_model(tiny.model(10), cameras=tiny.cameras(2))
     with pytest.warns(UserWarning, match=r"state cannot be written \(Read-only file system\), so that this run could not be resumed"):
-        assert model.adapt(1 / 4, steps=1, resume=tmp_path / "state").report.ended_by == "1 steps"
+        assert model.adapt(1 / 4, steps=1, resume=tmp_path / "state").report.ended_by == "1 step"
 
 
 def test_states_beyond_the_last_are_refused(tmp_path):

@@ -7,7 +7,9 @@ import pytest
 import tiny
 from small_jobs import QUICK, job_of
 
+from mipmap_plugin.commands.many import Request, jobs_of
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Outcome
 from mipmap_plugin.jobs.listing import find_checkpoints, read_list, shard, without_outputs
 from mipmap_plugin.jobs.run import run as run_job
@@ -26,6 +28,14 @@ def test_a_broken_scene_does_not_stop_the_others(run, scenes):
     assert code == 2 and "2 of 6 jobs failed" in err
     assert "6 jobs: 2 failed, 4 done" in out and "broken.ply" in out
     assert {path.name for path in scenes.iterdir()} >= {"chair_x0.5", "chair_x4", "lego_x0.5", "lego_x4"}
+
+
+def test_what_a_job_failed_by_is_told_by_its_path_from_here(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tiny.ply(tmp_path / "a b.ply")
+    code, out, err = run("adapt", "a b.ply", "no where.ply", "--scale", "1/2", *NO_STEP)
+    assert code == 2 and "  no where.ply does not exist" in out and "failed, no where.ply does not exist" in err
+    assert str(tmp_path) not in out + err
 
 
 def test_jobs_that_fail_side_by_side_leave_no_empty_folder(run, scenes, tmp_path, monkeypatch):
@@ -122,7 +132,8 @@ def test_cameras_of_each_scene(run, tmp_path):
         ("a.ply b.ply --scale 4 --jobs 2 --dask local:2", "leave one of them out"),
         ("a.ply --scale 4 --send-files", "--send-files sends them to the workers of --dask"),
         ("a.ply b.ply --scale 4 --jobs 2 --send-files", "--send-files sends them to the workers of --dask"),
-        ("x/a.ply y/a.ply --scale 4 --output new", "would both be written to"),
+        ("x/a.ply y/a.ply --scale 4 --output new", ": x/a.ply and y/a.ply would both be written to new/a_x4.ply; leave --output out"),
+        ("a.ply b.ply --scale 4 --scale 4.0000001", ": two scales of a.ply would both be written to a_x4.ply; give scales that differ more"),
         ("*.spz --scale 4", "no file or folder fits this pattern"),
         ("--list nowhere.txt --scale 4", "nowhere.txt: No such file"),
     ],
@@ -139,6 +150,16 @@ def test_without_words_a_checkpoint_is_asked_for(run):
 
 
 # Lists
+
+
+def test_jobs_know_where_the_network_lies_that_the_command_names_from_its_folder(tmp_path, monkeypatch):
+    """A worker may run in another folder."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "net.pth").write_bytes(b"")
+    for name, file in {"net.pth": tmp_path / "net.pth", "lanczos": None}.items():
+        request = Request([(2.0, None)], None, {"recipe": "default", "upsampler": name}, None, False)
+        [job] = jobs_of(tmp_path / "a.ply", request, Base(Path()), several=False)
+        assert (job.network, job.settings["upsampler"]) == (file, name)
 
 
 def test_shards_are_all_jobs_each_once():

@@ -1,10 +1,12 @@
 """A job that travels to another machine makes the same bytes there, and what comes back is whole."""
 
+import importlib.util
 from dataclasses import replace
 
 import corpus
 import pytest
 import tiny
+import torch
 from small_jobs import job_of
 
 from mipmap_plugin.adaptation.optimization.loop import adapt
@@ -37,6 +39,28 @@ def test_a_job_that_travels_makes_the_same_bytes(tmp_path, given):
         unpack(delivery, away)
     failed = unpack(do_parcel(replace(parcel, job=replace(parcel.job, viewer="nobody")), run_job), away)
     assert failed.status == "failed" and "nobody" in failed.reason
+
+
+def test_the_network_of_a_job_travels(tmp_path, monkeypatch):
+    """The worker has another folder, where the path of the settings leads nowhere."""
+    if importlib.util.find_spec("spandrel") is None:
+        pytest.skip("spandrel is in the extra sr")
+    from test_super_resolution import compact
+
+    monkeypatch.setenv("MIPMAP_PLUGIN_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    torch.save(compact(None).state_dict(), "net.pth")
+    settings = {"steps": 1, "seed": 0, "views": "given", "upsampler": "net.pth"}
+    here = job_of(tmp_path, scale=2.0, settings=settings, network=tmp_path / "net.pth")
+    assert run_job(here).status == "done"
+    parcel, away = pack(there := replace(here, target=tmp_path / "away" / "new.ply")), tmp_path / "other"
+    away.mkdir()
+    monkeypatch.chdir(away)
+    delivery = do_parcel(parcel, run_job)
+    monkeypatch.chdir(tmp_path)
+    outcome = unpack(delivery, there)
+    assert outcome.status == "done" and outcome.file.read_bytes() == here.target.read_bytes()
+    assert finished(there)
 
 
 def test_the_report_of_a_job_that_traveled_names_no_folder_of_the_worker(tmp_path):

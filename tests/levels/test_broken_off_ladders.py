@@ -11,11 +11,13 @@ from brief_levels import request, wrapped
 
 from mipmap_plugin import cli, wrap_model
 from mipmap_plugin.adaptation.optimization.run import Run
+from mipmap_plugin.commands.ladders import Exports
 from mipmap_plugin.errors import OutputError, SceneError, SettingsError
 from mipmap_plugin.evaluation.tradeoff.measuring import on_backend
 from mipmap_plugin.formats import staging
 from mipmap_plugin.levels.ladder import make_levels
 from mipmap_plugin.levels.request import FINEST_RATIO
+from mipmap_plugin.levels.store import is_of
 from mipmap_plugin.wrap import Interrupted
 
 pytestmark = pytest.mark.usefixtures("brief_ladders", "few_views")
@@ -223,3 +225,24 @@ def test_levels_of_another_ladder_are_not_taken(tmp_path, monkeypatch):
 def test_what_is_no_path_to_go_on_from_is_named(by):
     with pytest.raises(SettingsError, match=r"^resume must be a text .*, got int$"):
         make_levels(wrapped(), request(by=by), resume=5)
+
+
+def test_an_export_that_failed_is_made_by_the_same_command(tmp_path, monkeypatch, capsys):
+    """The levels, which took longer, are in their place already."""
+    words = ["levels", str(tiny.folder(tmp_path / "base", tiny.cameras(2))), "--viewer", "antialiased", "--coarsest", "1", "--by", "zoom", "--recipe"]
+    words += ["instant", "--output", str(tmp_path / "ladder")]
+    with monkeypatch.context() as failing:
+        failing.setattr(Exports, "write", lambda *_: (_ for _ in ()).throw(OutputError("the disk is full")))
+        assert cli.main(words) == 2
+    assert "ladder has the levels, and the same command goes on from these" in capsys.readouterr().err
+    assert cli.main([*words, "--seed", "1"]) == 2  # another ladder does not replace it
+    assert "holds levels of another base, viewer or settings" in capsys.readouterr().err
+    assert cli.main(words) == 0 and {path.name for path in tmp_path.iterdir()} == {"base", "ladder"}
+    assert cli.main(words) == 2 and "ladder exists already" in capsys.readouterr().err
+
+
+def test_a_ladder_that_was_changed_since_is_not_replaced(tmp_path):
+    ladder = make_levels(wrapped(), request(coarsest=0.9), tmp_path / "state").save(tmp_path / "ladder", keep_resume=True)
+    assert is_of(tmp_path / "state", ladder)
+    (ladder / "levels.json").write_text("{}")
+    assert not is_of(tmp_path / "state", ladder)

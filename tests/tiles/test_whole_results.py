@@ -64,7 +64,7 @@ def test_a_large_scene_takes_fewer_steps_in_tiles_too(job, monkeypatch):
     [
         ({}, "2 tiles of 4 steps", 4),
         ({"target_db": 1.0, "warm_up": 0.5}, "target of 1 dB against the pseudo truth, 2 tiles of 2 steps", 2),
-        ({"time_budget_s": 1e-6}, "time budget of 1e-06 s, 2 tiles of 1 steps at most", 1),
+        ({"time_budget_s": 1e-6}, "time budget of 1e-06 s, 2 tiles of 1 step at most", 1),
         ({"steps": 0}, "2 tiles of 0 steps", 0),
     ],
 )
@@ -109,9 +109,9 @@ def test_a_model_folder_is_written_beside_the_checkpoint(job, capsys):
 
 def test_the_bar_of_a_tile_says_which_it_is_and_no_db(job, monkeypatch):
     """Which it has not: it is measured as a part of the whole."""
-    told, began = [], loop.Bar.__init__
-    monkeypatch.setattr(loop.Bar, "__init__", lambda bar, **options: (told.append(options["desc"]), began(bar, **options))[1])
-    monkeypatch.setattr(loop.Bar, "set_postfix_str", lambda bar, text: told.append(text))
+    told, began = [], loop.StepsBar.__init__
+    monkeypatch.setattr(loop.StepsBar, "__init__", lambda bar, **options: (told.append(options["desc"]), began(bar, **options))[1])
+    monkeypatch.setattr(loop.StepsBar, "set_postfix_str", lambda bar, text: told.append(text))
     monkeypatch.setattr(run, "announced", lambda what: (told.append(what), nullcontext())[1])
     adapt_in_tiles(replace(job, settings=job.settings | {"closed_form": False, "steps": 2}), 2)
     assert set(told) == {"cutting", "adapting tile 1 x0.5", "adapting tile 2 x0.5", "40 splats", "measuring the whole", "writing out.ply"}

@@ -54,7 +54,7 @@ def test_a_maximum_of_steps_is_one_run_of_a_recipe_without_steps():
     plan = replace(PLAN, recipes=("instant", "default"), steps=(1, 2), repeats=1)
     points = list(measure(wrapped(), base_itself(wrapped(), 1 / 2, 1), 1 / 2, plan))
     assert [(point.name, point.ended_by) for point in points if point.kind == "adapted" and point.ended_by] == [
-        ("instant", "0 steps"), ("default, 1 steps at most", "1 steps"), ("default, 2 steps at most", "2 steps")
+        ("instant", "0 steps"), ("default, 1 step at most", "1 step"), ("default, 2 steps at most", "2 steps")
     ]  # fmt: skip
 
 

@@ -11,6 +11,7 @@ import tiny
 from live_screen import wish
 
 from mipmap_plugin.cli import main
+from mipmap_plugin.commands import view
 from mipmap_plugin.commands.view import _choices, _free, has_display
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.splatting.viewers import find_viewer
@@ -72,6 +73,14 @@ def test_a_viewer_is_listed_once_under_the_name_that_was_asked_for(base):
 def test_wrong_options_are_told(tmp_path, capsys, options, message):
     words = ["view", str(tiny.ply(tmp_path / "base.ply")), "--no-browser"]
     assert main([*words, *options]) == 2 and message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("asked", "served", "told"), [(8080, 8080, ""), (8080, 8081, " (port 8080 is taken)"), (0, 40123, "")])
+def test_a_port_that_is_taken_is_told(tmp_path, monkeypatch, capsys, asked, served, told):
+    page = MagicMock(address=f"http://127.0.0.1:{served}", **{"run.side_effect": KeyboardInterrupt})
+    monkeypatch.setattr(view, "_page", lambda *_: page)
+    assert main(["view", str(tiny.ply(tmp_path / "base.ply")), "--no-browser", "--port", str(asked)]) == 0
+    assert f":{served} shows base.ply{told}; Ctrl-C ends it\n" in capsys.readouterr().out
 
 
 def test_an_address_that_cannot_be_served_is_told():

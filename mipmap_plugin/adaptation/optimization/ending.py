@@ -5,6 +5,7 @@ from __future__ import annotations
 from enum import Enum
 
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.errors import plural
 
 
 class End(Enum):
@@ -23,7 +24,7 @@ class End(Enum):
         budget = f"time budget of {(config.time_budget_s or 0.0) / share:g} s"
         match self:
             case End.STEPS:
-                return f"{steps} steps"
+                return plural(steps, "step")
             case End.TIME:
                 return budget
             case End.START:

@@ -12,7 +12,6 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.views import ViewSchedule
@@ -20,6 +19,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.process import threads
 from mipmap_plugin.process.clock import now
+from mipmap_plugin.progress import Bar
 
 Result = TypeVar("Result")
 
@@ -103,7 +103,7 @@ def _mean(seconds: Any) -> float:
     return sum(seconds) / len(seconds) if seconds else 0.0
 
 
-class Bar(tqdm):  # type: ignore[misc]  # tqdm has no types
+class StepsBar(Bar):
     """A progress bar of steps that shows the time left by a forecast, where tqdm would take all steps as equally long."""
 
     seconds_left = math.inf

@@ -14,7 +14,7 @@ from mipmap_plugin.adaptation.optimization import density
 from mipmap_plugin.adaptation.optimization.activation import Activation
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.ending import End
-from mipmap_plugin.adaptation.optimization.estimate import BAR, Bar, Forecast
+from mipmap_plugin.adaptation.optimization.estimate import BAR, Forecast, StepsBar
 from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.optimization.growing import control_density, frozen_parameters, undo_harmful_growth
 from mipmap_plugin.adaptation.optimization.interrupt import interruptible
@@ -57,7 +57,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     run.costs.motion = lambda: task.follow.seconds
     forecast = Forecast(order, config, partial(checks_until, config), Evaluations(task.follow, config, len(task.validation.steering)), run.step)
     began = run.watch.seconds - run.costs.seconds()
-    bar = Bar(total=config.steps, initial=run.step, disable=None, desc=f"adapting {task.part or f'x{task.scale:g}'}", unit="step", bar_format=BAR)
+    bar = StepsBar(total=config.steps, initial=run.step, desc=f"adapting {task.part or f'x{task.scale:g}'}", unit="step", bar_format=BAR)
     with bar, ticking(bar), interruptible() as interrupted:
         reason = End.OBSERVER if observe(run) else run.reason_to_stop(config)
         while reason is None and run.step < config.steps:

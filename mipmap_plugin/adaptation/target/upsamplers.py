@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,9 @@ UPSAMPLERS = Registry(
     {name: f"mipmap_plugin.adaptation.target.upsamplers:{name}" for name in ("bicubic", "lanczos")},
 )
 
+# Where networks' files lie in this process that settings name by the paths of another one.
+_PLACES: dict[str, Path] = {}
+
 
 def register_upsampler(name: str, target: Any, *, replace: bool = False) -> None:
     """Register a function `(image [H, W, 3], size) -> [size[0], size[1], 3]`, or `"package.module:function"`, under `name`."""
@@ -39,7 +43,7 @@ def find_upsampler(name: str) -> Upsampler:
     """
     check_upsampler(name)
     if name not in UPSAMPLERS.names():
-        return Network(name)
+        return Network(_file(name))
     upsampler = UPSAMPLERS.get(name)
     if not callable(upsampler):
         raise PluginError(f"upsampler {name!r} is of type {type(upsampler).__name__}; make it a function (image, size) -> image")
@@ -74,14 +78,29 @@ def check_upsampler(name: str) -> None:
         return
     if not name.endswith(SUFFIXES):
         raise SettingsError(f"there is no upsampler {name!r}; choose from {', '.join(known)}, or give the file of a network ({', '.join(SUFFIXES)})")
-    if not Path(name).is_file():
+    if not _file(name).is_file():
         raise SettingsError(f"there is no upsampler file {name}; check the path")
 
 
 def network_input(name: str) -> dict[str, str]:
     """A hash of the network that an adaptation is given, if it is a file, as its provenance records it (`Report.inputs`); empty without one."""
-    is_file = name not in UPSAMPLERS.names() and Path(name).is_file()
-    return {"network": sha256(Path(name))} if is_file else {}
+    is_file = name not in UPSAMPLERS.names() and _file(name).is_file()
+    return {"network": sha256(_file(name))} if is_file else {}
+
+
+@contextmanager
+def placed(name: str, file: Path | None) -> Iterator[None]:
+    """Inside, read the network that settings name from `file`, unless that is None."""
+    if file is not None:
+        _PLACES[name] = file
+    try:
+        yield
+    finally:
+        _PLACES.pop(name, None)
+
+
+def _file(name: str) -> Path:
+    return _PLACES.get(name, Path(name))
 
 
 def bicubic(image: Tensor, size: tuple[int, int]) -> Tensor:

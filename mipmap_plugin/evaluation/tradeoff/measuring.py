@@ -12,14 +12,14 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.evaluation.cells import Cells
+from mipmap_plugin.errors import plural
+from mipmap_plugin.evaluation.cells import Cells, made_by
 from mipmap_plugin.evaluation.measure import (
     BASE,
     FILTERS,
@@ -34,7 +34,7 @@ from mipmap_plugin.evaluation.measure import (
 from mipmap_plugin.evaluation.tradeoff.points import NOTHING, Plan, Point, Spread
 from mipmap_plugin.evaluation.tradeoff.truth import GroundTruth
 from mipmap_plugin.models.base import SplatModel, count_of
-from mipmap_plugin.progress import ticking
+from mipmap_plugin.progress import Bar, ticking
 from mipmap_plugin.recipes import most_steps
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.screen_filters import SCREEN_FILTERS
@@ -74,7 +74,7 @@ class _Measurement:
         plan, scale = self._plan, self._scale
         free = [each for backend in plan.backends for each in _baselines(on_backend(self._model, backend), self._truth, scale, plan)]
         total = len(free) + len(self._runs) * plan.repeats + len(RENDERERS) * plan.renderers
-        with tqdm(total=total, disable=None, desc=f"tradeoff x{scale:g}") as bar, ticking(bar):
+        with Bar(total=total, desc=f"tradeoff x{scale:g}") as bar, ticking(bar):
             for baseline in free:
                 yield from self._kept({"baseline": baseline.name, "backend": baseline.backend}, partial(self._of_baseline, baseline))
                 bar.update()
@@ -88,7 +88,7 @@ class _Measurement:
 
     def _made(self, recipe: str) -> dict[str, Any]:
         """The settings of a recipe; a registered one may have been edited since an interruption."""
-        return make_config(recipe, self._scale).model_dump()
+        return made_by(make_config(recipe, self._scale))
 
     def _kept(self, key: dict[str, Any], measure: Callable[[], list[Point]]) -> list[Point]:
         """The points of a cell: measured now, or kept from before an interruption."""
@@ -104,7 +104,7 @@ class _Measurement:
         point = Point(self._scale, baseline.kind, baseline.name, baseline.backend, baseline.gaussians)
         return [_measured(point, baseline.render, self._truth, self._plan.repeats)]
 
-    def _of_run(self, recipe: str, steps: int | None, backend: str, bar: tqdm) -> list[Point]:
+    def _of_run(self, recipe: str, steps: int | None, backend: str, bar: Bar) -> list[Point]:
         """The intermediate and final points of a recipe, with a number of steps, over all repeats."""
         model, truth, scale, plan = on_backend(self._model, backend), self._truth, self._scale, self._plan
         if backend not in self._warm:
@@ -139,7 +139,7 @@ class _Measurement:
 
         return [*(between(step, values) for step, values in measured.items()), _over_repeats(ends)]
 
-    def _of_renderers(self, bar: tqdm) -> list[Point]:
+    def _of_renderers(self, bar: Bar) -> list[Point]:
         """The points of the model of the first run, if there is one, or else of the base, in other renderers."""
         if self._runs and self._first is None:  # it was measured before an interruption
             self._of_run(*self._runs[0], bar)
@@ -189,7 +189,7 @@ def _measured(point: Point, show: RenderView, truth: GroundTruth, repeats: int) 
 
 
 def _name(recipe: str, steps: int | None) -> str:
-    return recipe if steps is None else f"{recipe}, {steps} steps at most"
+    return recipe if steps is None else f"{recipe}, {plural(steps, 'step')} at most"
 
 
 def _spreads(**values: Sequence[float]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.views import choose_views, with_times
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, plural
 from mipmap_plugin.evaluation.measure import RESIZED, resized_base, supersampled, views_seen
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.other_scene import of_another_scene, of_another_size
@@ -61,7 +61,7 @@ def photographs(model: Wrapped, scene: Scene, scale: float, most: int | None) ->
     if doubt := of_another_scene(model, [judged[view] for view in views], scale, protocol):
         warnings.warn(doubt, stacklevel=2)
     truths = {view: judged[view].truth(scale, protocol) for view in views}
-    label = f"real dB, protocol P3 on {len(views)} photograph{'s' if len(views) > 1 else ''}"
+    label = f"real dB, protocol P3 on {plural(len(views), 'photograph')}"
     return GroundTruth(label, views, adapt_on, lambda view, image: psnr(protocol.as_saved(image), truths[view]), protocol.shrink_by)
 
 
@@ -75,7 +75,7 @@ def base_itself(model: Wrapped, scale: float, most: int | None, views: Sequence[
     held_out, adapt_on = _held_out(model)
     views = list(views) or evenly(held_out, most)
     base_images = {view: model.render(view).image.clamp(0, 1) for view in views}
-    counted = f"(no photographs), {len(views)} view{'s' if len(views) > 1 else ''}"
+    counted = f"(no photographs), {plural(len(views), 'view')}"
     if scale > 1:
         label = f"dB of the image, shrunk, against the base itself {counted}"
         return GroundTruth(label, views, adapt_on, lambda view, image: psnr(resize(image, view.size, "area"), base_images[view]), "area", (RESIZED,))
