@@ -16,9 +16,17 @@ Item = TypeVar("Item")
 PATIENCE, PERIOD = 1.0, 0.5
 
 
+def hidden() -> bool:
+    """Whether no progress is shown: standard error is no terminal. A program may have none, or have put in its place a log without `isatty`."""
+    try:
+        return not sys.stderr.isatty()
+    except (AttributeError, ValueError):  # ValueError: it is closed
+        return True
+
+
 def counted(items: Iterable[Item], total: int, what: str, unit: str) -> Iterator[Item]:
     """Yield the items, and show on a terminal how many of them are done."""
-    bar = tqdm(items, total=total, desc=what, unit=unit, disable=None)
+    bar = tqdm(items, total=total, desc=what, unit=unit, disable=hidden())
     with ticking(bar):
         yield from bar
 
@@ -26,7 +34,7 @@ def counted(items: Iterable[Item], total: int, what: str, unit: str) -> Iterator
 @contextmanager
 def told(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
     """Show progress on a terminal; the block calls the function that it is given with how many are done, and of how many."""
-    with tqdm(desc=what, unit=unit, disable=None) as shown:
+    with tqdm(desc=what, unit=unit, disable=hidden()) as shown:
 
         def tell(done: int, total: int) -> None:
             shown.total = total
@@ -43,7 +51,7 @@ def note(line: str) -> None:
 @contextmanager
 def announced(what: str) -> Iterator[None]:
     """Show `what` and its seconds on standard error while the block runs, once it has taken a second; nothing where that is no terminal."""
-    with meanwhile(lambda ended: _show(what, ended)) if sys.stderr.isatty() else nullcontext():
+    with nullcontext() if hidden() else meanwhile(lambda ended: _show(what, ended)):
         yield
 
 

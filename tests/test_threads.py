@@ -169,6 +169,31 @@ def test_long_work_is_announced_on_a_terminal_alone(terminal, patience, line, mo
     assert line in errors.getvalue() and bool(errors.getvalue()) == bool(line)
 
 
+class Log:
+    """What a program may put in the place of standard error, to have it in a file of its own."""
+
+    written = ""
+
+    def write(self, text):
+        self.written += text
+
+
+def closed():
+    stream = io.StringIO()
+    stream.close()
+    return stream
+
+
+@pytest.mark.parametrize("stream", [None, Log(), closed()])
+def test_a_program_without_a_standard_error_adapts(stream, tmp_path, monkeypatch):
+    """As one that runs in the background, or without a window."""
+    monkeypatch.setattr(sys, "stderr", stream)
+    wrapped = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="cpu", threads=1)
+    adapted = wrapped.adapt(1 / 2, steps=1, extra_views=2, validation_views=2)
+    assert list(progress.counted([adapted.save(tmp_path / "new.ply")], 1, "saving", "file"))
+    assert not getattr(stream, "written", "")
+
+
 def test_what_takes_seconds_of_a_large_scene_is_announced(tmp_path, monkeypatch):
     told = []
     monkeypatch.setattr(sys, "stderr", Terminal())

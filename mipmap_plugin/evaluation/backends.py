@@ -16,6 +16,7 @@ from mipmap_plugin.backends.conformance import CASES, MORE, Outcome, check_backe
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.evaluation.report import markdown
 from mipmap_plugin.process import threads
+from mipmap_plugin.progress import hidden
 
 # Reasons that are told beside the table of cases: the most frequent.
 REASONS = 5
@@ -46,7 +47,7 @@ def check(name: str, *, full: bool = False) -> list[Outcome]:
     cases = {**CASES, **MORE} if full else CASES
     with threads.limited(1, shared=False):  # four times as fast as two for images this small
         for device, dtype in product(_devices(), (torch.float32, torch.float64)):
-            progress = tqdm(cases.items(), disable=None, desc=f"checking {name} on {device}", unit="case")
+            progress = tqdm(cases.items(), disable=hidden(), desc=f"checking {name} on {device}", unit="case")
             outcomes = [outcome for case, build in progress for outcome in check_backend(backend, {case: build}, dtype=dtype, device=device)]
             if not all(outcome.skipped for outcome in outcomes):
                 return outcomes

@@ -34,6 +34,7 @@ from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.photographs import digest_of_image
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, not_held_out, views_of_placed
 from mipmap_plugin.evaluation.shots import Recorder, Shot, Watcher
+from mipmap_plugin.progress import hidden
 from mipmap_plugin.recipes import most_steps
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
@@ -91,7 +92,7 @@ class Evaluator:
         """The mean quality of `show(camera at the base scale)` over the views. PSNRs of views are averaged, as in the literature."""
         psnrs, similarities, distances = [], [], []
         watch = warm_stopwatch(show, self.views[0].camera)
-        for view in tqdm(self.views, disable=None, desc=f"{name} x{scale:g}", leave=False):
+        for view in tqdm(self.views, disable=hidden(), desc=f"{name} x{scale:g}", leave=False):
             with torch.no_grad(), watch:
                 image = show(view.camera)
             image, truth = self.protocol.as_saved(image), view.truth(scale, self.protocol).to(image)

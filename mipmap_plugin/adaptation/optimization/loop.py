@@ -27,7 +27,7 @@ from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.process.threads import side_by_side
-from mipmap_plugin.progress import ticking
+from mipmap_plugin.progress import hidden, ticking
 
 # Number of checks during the warm-up, while the rates rise.
 CHECKS_IN_WARM_UP = 10
@@ -57,7 +57,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     run.costs.motion = lambda: task.follow.seconds
     forecast = Forecast(order, config, partial(checks_until, config), Evaluations(task.follow, config, len(task.validation.steering)), run.step)
     began = run.watch.seconds - run.costs.seconds()
-    bar = Bar(total=config.steps, initial=run.step, disable=None, desc=f"adapting {task.part or f'x{task.scale:g}'}", unit="step", bar_format=BAR)
+    bar = Bar(total=config.steps, initial=run.step, disable=hidden(), desc=f"adapting {task.part or f'x{task.scale:g}'}", unit="step", bar_format=BAR)
     with bar, ticking(bar), interruptible() as interrupted:
         reason = End.OBSERVER if observe(run) else run.reason_to_stop(config)
         while reason is None and run.step < config.steps:

@@ -23,6 +23,7 @@ from mipmap_plugin.adaptation.target.upsamplers import find_upsampler
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.process.clock import now
+from mipmap_plugin.progress import hidden
 from mipmap_plugin.recipes import INTERPOLATIONS
 
 # Iterations of back-projection: the first improves a GAN's image by 1.4 dB (lego at x2), two more by another 0.2.
@@ -62,7 +63,7 @@ class DetailLoss:
         order = spread(Halves.of(range(len(views)), places(views)), torch.Generator().manual_seed(self._config.seed))
         device, done = self._truth(views[order[0]]).device, []
         began = now(device)
-        for number in tqdm(order, disable=None, desc=f"upsampling x{self._scale:g}", unit="view"):
+        for number in tqdm(order, disable=hidden(), desc=f"upsampling x{self._scale:g}", unit="view"):
             self._target(views[number])
             done.append(number)
             if (now(device) - began) * (len(done) + 1) / len(done) > seconds:

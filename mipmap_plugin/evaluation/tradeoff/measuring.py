@@ -34,7 +34,7 @@ from mipmap_plugin.evaluation.measure import (
 from mipmap_plugin.evaluation.tradeoff.points import NOTHING, Plan, Point, Spread
 from mipmap_plugin.evaluation.tradeoff.truth import GroundTruth
 from mipmap_plugin.models.base import SplatModel, count_of
-from mipmap_plugin.progress import ticking
+from mipmap_plugin.progress import hidden, ticking
 from mipmap_plugin.recipes import most_steps
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.screen_filters import SCREEN_FILTERS
@@ -74,7 +74,7 @@ class _Measurement:
         plan, scale = self._plan, self._scale
         free = [each for backend in plan.backends for each in _baselines(on_backend(self._model, backend), self._truth, scale, plan)]
         total = len(free) + len(self._runs) * plan.repeats + len(RENDERERS) * plan.renderers
-        with tqdm(total=total, disable=None, desc=f"tradeoff x{scale:g}") as bar, ticking(bar):
+        with tqdm(total=total, disable=hidden(), desc=f"tradeoff x{scale:g}") as bar, ticking(bar):
             for baseline in free:
                 yield from self._kept({"baseline": baseline.name, "backend": baseline.backend}, partial(self._of_baseline, baseline))
                 bar.update()
