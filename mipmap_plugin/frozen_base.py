@@ -180,11 +180,11 @@ class FrozenBase:
         float32, and torch may have one thread, in the whole process: torch has one of each. Raises SettingsError and BackendUnavailable.
         """
         scale, cameras = check_scale(scale), None if cameras is None else of_base_scale(cameras, some=True)
-        finer = as_start(start, viewer)
         check_kinds(observe=(observe, Callable))
         scene = None if images is None else scene_of(self.model, images)
         state = None if resume is None else path_of(resume, "resume")
         model = self._fused if viewer is not None and self.model.traits.filtered else self.model
+        finer = as_start(start, viewer, scale, model)
         if scene and self.model.traits.exposures.changed:
             raise SettingsError("the images were exposed differently, which adaptation does not support (exposure.json); leave them out")
         there = self.place(scene) if scene else None
@@ -198,8 +198,6 @@ class FrozenBase:
         backend, note, has_gradients = choose(self._backend, config, needs, self._needs)
         if config.steps:
             refuse_large(cameras or self.views(), self.model, scale)
-        if finer is not None and finer.scale <= scale:
-            raise SettingsError(f"start: x{finer.scale:g} is not finer than x{scale:g}; leave it out")
         base_in_viewer = model if (in_viewer := self.read_by(viewer)) is self.model else in_viewer
         base_images = self._base_images(model, backend, self.keeps_images or first is not None)
         request = AdaptationRequest(base_images, targets, viewer, note, has_gradients, self.viewpoints, base_in_viewer, finer, inputs)

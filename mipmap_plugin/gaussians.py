@@ -12,7 +12,7 @@ from torch import Tensor
 from mipmap_plugin.errors import ShapeError
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Gaussians:
     """N splats in world space, activated: scales are lengths, opacities lie in 0..1. Raises ShapeError if the tensors do not fit together.
 
@@ -48,6 +48,11 @@ class Gaussians:
                 raise ShapeError(f"{name}: expected shape {list(shape)}, got {list(tensor.shape)}")
             if (tensor.device, tensor.dtype) != (self.means.device, self.means.dtype):
                 raise ShapeError(f"{name}: {tensor.dtype} on {tensor.device}, but means are {self.means.dtype} on {self.means.device}")
+
+    def __repr__(self) -> str:
+        kind = f"{str(self.means.dtype).removeprefix('torch.')} on {self.means.device}"
+        covariances = "" if self.covariances is None else ", with covariances"
+        return f"<Gaussians: splats {len(self):,}, SH degree {self.sh_degree}, {kind}{covariances}>"
 
     def __len__(self) -> int:
         return self.means.shape[0]

@@ -25,7 +25,7 @@ class Bar(tqdm):  # type: ignore[misc]  # tqdm has no types
 
     def __init__(self, *args: Any, **options: Any) -> None:
         unsized = {"ncols": COLUMNS - 1, "nrows": LINES - 1} if _has_no_size() else {}
-        super().__init__(*args, **{"disable": None, **unsized, **options})
+        super().__init__(*args, **{"disable": hidden(), **unsized, **options})
 
 
 def _has_no_size() -> bool:
@@ -34,6 +34,14 @@ def _has_no_size() -> bool:
         return 0 in os.get_terminal_size(sys.stderr.fileno())
     except (OSError, ValueError, AttributeError):
         return False
+
+
+def hidden() -> bool:
+    """Whether no progress is shown: standard error is no terminal. A program may have none, or have put in its place a log without `isatty`."""
+    try:
+        return not sys.stderr.isatty()
+    except (AttributeError, ValueError):  # ValueError: it is closed
+        return True
 
 
 def counted(items: Iterable[Item], total: int, what: str, unit: str) -> Iterator[Item]:
@@ -63,7 +71,7 @@ def note(line: str) -> None:
 @contextmanager
 def announced(what: str) -> Iterator[None]:
     """Show `what` and its seconds on standard error while the block runs, once it has taken a second; nothing where that is no terminal."""
-    with meanwhile(lambda ended: _show(what, ended)) if sys.stderr.isatty() else nullcontext():
+    with nullcontext() if hidden() else meanwhile(lambda ended: _show(what, ended)):
         yield
 
 

@@ -10,7 +10,7 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin import load_model, wrap_model
+from mipmap_plugin import load_model, load_scene, wrap_model
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import MipmapPluginError, SettingsError
 from mipmap_plugin.formats.images import image_size
@@ -41,6 +41,15 @@ def test_an_adapted_model_says_what_it_is_and_gained(adapted):
     splats, seconds = f"60 -> {report.gaussians_after}", f"{report.seconds['total']:.1f}"
     expected = f"family 3dgs, scale x0.5, made for classic, splats {splats}, PSNR {gain}, seconds {seconds}, ended by 3 steps"
     assert repr(adapted) == f"<Adapted: {expected}>"
+
+
+def test_what_holds_many_numbers_says_what_it_is_in_a_line(base, adapted, tmp_path):
+    path, report = tiny.scene(tmp_path / "scene", tiny.cameras(2)), adapted.report
+    gain = f"{report.psnr_before():.2f} -> {report.psnr_after():.2f} dB on views that nothing was adapted to"
+    splats = f"60 -> {report.gaussians_after}"
+    assert repr(load_scene(path)) == f"<Scene: cameras 2 of 32 x 24 px, photographs 2, from {path}>"
+    assert repr(base.model.gaussians()) == "<Gaussians: splats 60, SH degree 1, float32 on cpu>"
+    assert str(report) == repr(report) == f"<Report: scale x0.5, splats {splats}, {gain}, ended by 3 steps>"
 
 
 @pytest.mark.parametrize("shown", ["base", "adapted"])

@@ -48,6 +48,7 @@ def test_cameras_may_be_a_path(tmp_path):
     (lambda adapted: adapted.render(adapted.views()), "cameras must be of the type mipmap_plugin.Camera, got list"),
     (lambda adapted: adapted.render(adapted.views()[0], outputs="depth"), "outputs must be a sequence of names, such as"),
     (lambda adapted: adapted.render(adapted.views()[0], outputs=3), "outputs must be a sequence of names, such as"),
+    (lambda adapted: adapted.render(adapted.views()[0], viewer=["spark"]), r"this model was not made for the viewer \['spark'\], but for no viewer"),
     (lambda adapted: adapted.save(None), "^path must be a text such as 'output/bicycle', or a pathlib.Path, got NoneType$"),
     (lambda adapted: adapted.save(""), "^path must be a text .*, got an empty text$"),
 ])  # fmt: skip
@@ -89,6 +90,14 @@ def test_an_adapted_model_may_be_what_a_coarser_one_starts_from(adapted):
         base.adapt(1 / 2, start=adapted)
     with pytest.raises(SettingsError, match="start must be a model that was adapted to a finer scale, got Wrapped"):
         base.adapt(1 / 4, start=base)
+    with pytest.raises(SettingsError, match="start: it was adapted from another base; leave it out"):
+        wrap_model(tiny.model(10, seed=1), cameras=tiny.cameras(), backend="reference").adapt(1 / 4, start=adapted)
+
+
+@pytest.mark.parametrize("given", [None, ["camera"], [None]])
+def test_only_cameras_are_written_as_such(given, tmp_path):
+    with pytest.raises(SettingsError, match=r"cameras must be of the type mipmap_plugin.Camera, got (NoneType|str)"):
+        write_cameras(tmp_path / "cameras.json", given)
 
 
 @pytest.mark.parametrize(("images", "sentence"), [

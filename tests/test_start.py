@@ -6,7 +6,7 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.optimization.validation import Validation
+from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
 from mipmap_plugin.adaptation.parallel import VIEWS_AT_ONCE
 from mipmap_plugin.adaptation.pixel_size import mean_pixel_size, pixel_size
 from mipmap_plugin.adaptation.report import AS_IT_IS, UNCHANGED, Report

@@ -6,6 +6,7 @@ import signal
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import tiny
@@ -61,6 +62,58 @@ def test_torch_has_one_thread_only_beside_kernels_with_threads_of_their_own(back
     wrapped = wrap_model(tiny.model(20), cameras=tiny.cameras(), backend=backend, threads=3)
     wrapped.adapt(1 / 2, steps=1, extra_views=2, observe=lambda *_: seen.append((torch.get_num_threads(), threads.for_views())))
     assert set(seen) == {(1, 3) if backend == "cpu" else (3, 1)} and torch.get_num_threads() == before
+
+
+def in_a_thread(function):
+    """What a function returns in a thread of its own."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(function).result()
+
+
+def test_threads_that_adapt_at_once_leave_torch_its_threads():
+    """A thread that begins while another adapts has the one thread of that, and would keep it, and leave it to those that come after both."""
+    begun, ended = threading.Event(), threading.Event()
+
+    def second():
+        with threads.limited(None, shared=True):
+            begun.set()
+            ended.wait(10)
+            return threads.for_kernels()
+
+    torch.set_num_threads(3)
+    try:
+        with ThreadPoolExecutor(1) as pool:
+            with threads.limited(None, shared=True):
+                counted = pool.submit(lambda: (second(), torch.get_num_threads()))
+                begun.wait(10)
+            ended.set()
+            assert counted.result() == (3, 3)
+        assert torch.get_num_threads() == in_a_thread(torch.get_num_threads) == 3
+    finally:
+        torch.set_num_threads(1)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
+def test_a_process_that_is_forked_while_others_adapt_has_the_threads_of_its_parent_s_thread():
+    ended, inside = threading.Event(), threading.Event()
+
+    def other():
+        with threads.limited(1, shared=True):
+            inside.set()
+            ended.wait(10)
+
+    with ThreadPoolExecutor(1) as pool:
+        torch.set_num_threads(2)
+        running = pool.submit(other)
+        inside.wait(10)
+        torch.set_num_threads(1)  # as a DataLoader does
+        child = os.fork()
+        if not child:
+            with threads.limited(None, shared=False):
+                os._exit(torch.get_num_threads())
+        ended.set()
+        running.result()
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
 
 
 @pytest.mark.parametrize("count", [1, 2, 4])
@@ -166,6 +219,31 @@ def test_long_work_is_announced_on_a_terminal_alone(terminal, patience, line, mo
     with progress.announced("merging x0.25"):
         time.sleep(0.2 if patience < 1 else 0)
     assert line in errors.getvalue() and bool(errors.getvalue()) == bool(line)
+
+
+class Log:
+    """What a program may put in the place of standard error, to have it in a file of its own."""
+
+    written = ""
+
+    def write(self, text):
+        self.written += text
+
+
+def closed():
+    stream = io.StringIO()
+    stream.close()
+    return stream
+
+
+@pytest.mark.parametrize("stream", [None, Log(), closed()])
+def test_a_program_without_a_standard_error_adapts(stream, tmp_path, monkeypatch):
+    """As one that runs in the background, or without a window."""
+    monkeypatch.setattr(sys, "stderr", stream)
+    wrapped = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="cpu", threads=1)
+    adapted = wrapped.adapt(1 / 2, steps=1, extra_views=2, validation_views=2)
+    assert list(progress.counted([adapted.save(tmp_path / "new.ply")], 1, "saving", "file"))
+    assert not getattr(stream, "written", "")
 
 
 def test_what_takes_seconds_of_a_large_scene_is_announced(tmp_path, monkeypatch):

@@ -27,7 +27,7 @@ from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_image, path_of
 from mipmap_plugin.models import contract, load_model
-from mipmap_plugin.models.base import SplatModel, checked_splats, effects_of, tensors_of
+from mipmap_plugin.models.base import SplatModel, checked_splats, digest_of_model, effects_of, tensors_of
 from mipmap_plugin.models.exposure import exposed
 from mipmap_plugin.models.mip import for_loader_of, unread
 from mipmap_plugin.models.outputs import cut_off, drawn_otherwise, parts_of, without_place
@@ -70,7 +70,7 @@ class Adapted:
         """Render the view of a camera of the new scale, in one of the `viewers`; `outputs` and `exposure` as in `Wrapped.render`."""
         [camera] = checked([camera])
         outputs = as_outputs(outputs)
-        if viewer is not None and viewer not in self.viewers:
+        if viewer is not None and viewer not in tuple(self.viewers):
             available = ", ".join(filter(None, self.viewers)) or "no viewer by name"
             raise SettingsError(f"this model was not made for the viewer {viewer!r}, but for {available}")
         effects = self.effects if viewer is None else self.viewers[viewer]
@@ -153,15 +153,27 @@ class Adapted:
         return "" if self.report.viewer else drawn_otherwise(path, self.model.trained)
 
 
-def as_start(start: Any, viewer: str | None) -> FinerLevel | None:
-    """What an adaptation for `viewer` starts from: of an adapted model, its splats. Raises SettingsError for anything else, or for another viewer."""
-    if start is None or isinstance(start, FinerLevel):
-        return start
-    if not isinstance(start, Adapted):
+def as_start(start: Any, viewer: str | None, scale: float, base: SplatModel) -> FinerLevel | None:
+    """What an adaptation of `base` to `scale` for `viewer` starts from: of an adapted model, its splats.
+
+    Raises SettingsError for anything else, and for a model of another viewer, of another base, or of a scale that is not finer.
+    """
+    if start is None:
+        return None
+    if not isinstance(start, (Adapted, FinerLevel)):
         raise SettingsError(f"start must be a model that was adapted to a finer scale, got {type(start).__name__}")
+    finer = start if isinstance(start, FinerLevel) else _level(start, viewer, base)
+    if finer.scale <= scale:
+        raise SettingsError(f"start: x{finer.scale:g} is not finer than x{scale:g}; leave it out")
+    return finer
+
+
+def _level(start: Adapted, viewer: str | None, base: SplatModel) -> FinerLevel:
     if start.report.viewer != viewer:
         made, wanted = (name or "what draws as the training did" for name in (start.report.viewer, viewer))
         raise SettingsError(f"start: it is made for {made}, and not for {wanted}; leave it out, or give the same viewer")
+    if start.report.base != digest_of_model(base):
+        raise SettingsError("start: it was adapted from another base; leave it out, or give a model that was adapted from this one")
     return FinerLevel(start.model, start.report.scale, f"the model adapted to x{start.report.scale:g}")
 
 

@@ -80,6 +80,12 @@ class Report(BaseModel):
     cameras_from: dict[str, str] = {}
     orbit: Orbit | None = None
 
+    def __repr__(self) -> str:
+        splats = f"{self.gaussians_before:,} -> {self.gaussians_after:,}"
+        return f"<Report: scale x{self.scale:g}, splats {splats}, {self.gain()}, ended by {self.ended_by}>"
+
+    __str__ = __repr__  # in place of all that it holds, which is `model_dump()`
+
     def psnr_before(self) -> float | None:
         """PSNR (dB) of the base on views that nothing was adapted to; None if it was not measured."""
         return self.validation.get(AS_IT_IS)

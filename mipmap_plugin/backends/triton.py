@@ -161,7 +161,7 @@ def missing() -> list[str]:
 def unbuilt() -> list[str]:
     """Why Triton cannot build what launches kernels, which takes a C compiler, Python's headers and the driver's library; empty if it can."""
     try:
-        importlib.import_module("triton.runtime").driver.active.utils  # noqa: B018  # it is built, once on a machine, when it is first asked for
+        importlib.import_module("triton.runtime").driver.active.get_current_target()  # built when first asked for
     except Exception as error:  # compilers, linkers and drivers fail in any way
         advice = "it takes a C compiler and Python's headers: install gcc and python3-dev"
         return [f"triton cannot build what launches its kernels ({brief(error)}); {advice}"]

@@ -176,10 +176,11 @@ def _mapping(model: Any) -> dict[str, Any]:
 
 
 def _copied(model: Any, tensors: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Contiguous float32 copies. Raises SettingsError for values that are neither tensors nor arrays of numbers, and for empty ones."""
+    """Contiguous float32 copies. Raises SettingsError for values that are neither tensors nor arrays of real numbers, and for empty ones."""
     tensors = {name: torch.from_numpy(np.array(value, np.float32)) if _is_array(value) else value for name, value in tensors.items()}
-    if missing := [name for name, tensor in tensors.items() if not torch.is_tensor(tensor)]:
-        raise SettingsError(f"this {_name(model)} holds no tensor for {', '.join(missing)}; load or train it first, or give tensors or arrays")
+    if missing := [name for name, tensor in tensors.items() if not _is_dense(tensor)]:
+        lacks = f"holds no tensor of real numbers for {', '.join(missing)}"
+        raise SettingsError(f"this {_name(model)} {lacks}; load or train it first, or give dense tensors or arrays")
     if any(len(tensor) == 0 for tensor in tensors.values()):
         raise SettingsError(f"this {_name(model)} has no splats yet; load or train it first")
     return {name: tensor.detach().to(torch.float32, copy=True, memory_format=torch.contiguous_format) for name, tensor in tensors.items()}
@@ -187,6 +188,11 @@ def _copied(model: Any, tensors: Mapping[str, Any]) -> dict[str, Tensor]:
 
 def _is_array(value: Any) -> bool:
     return isinstance(value, np.ndarray) and value.ndim > 0 and value.dtype.kind in "fiu"
+
+
+def _is_dense(value: Any) -> bool:
+    """Whether it is a tensor that holds real numbers: one on the device meta holds none, before a model is loaded."""
+    return torch.is_tensor(value) and value.layout == torch.strided and value.dim() > 0 and not (value.is_meta or value.is_complex())
 
 
 def _adopted(model: Any, raw: dict[str, Tensor], trained: TrainedScale, origin: Origin, kind: type[VanillaModel] = VanillaModel) -> VanillaModel:

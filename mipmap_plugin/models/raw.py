@@ -15,15 +15,20 @@ MIN_SCALE = 1e-18
 
 
 def check(parameters: dict[str, Tensor]) -> None:
-    """Raise ShapeError unless the parameters are those of 3DGS, in shapes that fit together."""
+    """Raise ShapeError unless the parameters are those of 3DGS, in shapes that fit together, and on one device."""
     if set(parameters) != set(OF_3DGS):
         raise ShapeError(f"parameters: expected means, scales, quats, opacities, sh0 and shN, got {', '.join(parameters)}")
-    n = len(parameters["means"])
+    if wrong := [name for name, tensor in parameters.items() if not isinstance(tensor, Tensor)]:
+        raise ShapeError(f"{wrong[0]}: expected a torch tensor, got {type(parameters[wrong[0]]).__name__}")
+    means = parameters["means"]
+    n = len(means) if means.dim() else 0
     bands = parameters["shN"].shape[1] if parameters["shN"].dim() == 3 else 0
     expected = {"means": (n, 3), "scales": (n, 3), "quats": (n, 4), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, bands, 3)}
     for name, shape in expected.items():
         if tuple(parameters[name].shape) != shape:
             raise ShapeError(f"{name}: expected shape {list(shape)}, got {list(parameters[name].shape)}")
+        if parameters[name].device != means.device:
+            raise ShapeError(f"{name}: it is on {parameters[name].device}, but means are on {means.device}; move all to one device")
     if 3 * bands not in SH_DEGREES:
         raise ShapeError(f"shN: {bands} coefficients fit no SH degree; 0, 3, 8, 15 or 24 do")
 

@@ -74,7 +74,7 @@ class Ending:
         on_ctrl_c = signal.getsignal(signal.SIGINT)
         if not callable(on_ctrl_c):
             raise KeyboardInterrupt
-        on_ctrl_c(signal.SIGINT, frame)
+        on_ctrl_c(number, frame)
 
 
 def _is_dropped_in(frame: FrameType | None) -> bool:
@@ -98,6 +98,11 @@ def presses() -> Presses:
     """The presses of the running command, which all of its parts share, so that each press counts once; outside of a command, a new record."""
     ending = getattr(signal.getsignal(signal.SIGINT), "__self__", None)
     return ending.presses if isinstance(ending, Ending) else Presses()
+
+
+def is_ours(handler: object) -> bool:
+    """Whether a handler of Ctrl-C is Python's own, or that of a command, and not of a program that this package is used in."""
+    return handler is signal.default_int_handler or isinstance(getattr(handler, "__self__", None), Ending)
 
 
 @contextmanager

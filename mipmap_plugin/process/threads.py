@@ -14,6 +14,7 @@ from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar, copy_context
 from functools import cache
 from operator import index
+from threading import Lock, local
 from typing import Any, SupportsIndex, TypeVar
 
 import torch
@@ -41,6 +42,7 @@ _forked = False
 def _note_fork() -> None:
     global _forked
     _forked = True
+    _Limits.lock, _Limits.blocks = Lock(), _limits.depth  # the other threads are not there
 
 
 if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
@@ -81,7 +83,7 @@ def limited(threads: int | None, *, shared: bool) -> Iterator[None]:
 
     Raises SettingsError for less than one, and for far more than the processor has.
     """
-    count = for_kernels() if threads is None else checked(threads)
+    count = (_shared.get() or _limits.usual_here()) if threads is None else checked(threads)
     token = _shared.set(count if shared else None)
     try:
         with _torch_threads(1 if shared else count):
@@ -102,14 +104,45 @@ def lent_to_torch() -> Iterator[None]:
         yield
 
 
+class _Limits(local):
+    """How torch's threads are limited at the moment. Torch has a number in each thread, and a new thread takes the one that was last set in any."""
+
+    depth = 0  # of the blocks that this thread is in
+    lock, blocks = Lock(), 0  # of all threads
+    last, usual = 0, 0  # the number that a block set last, and that of before the first block
+
+    def usual_here(self) -> int:
+        """The number of this thread, but not one that it took from the block of another: that would stay when all blocks have ended."""
+        now = torch.get_num_threads()
+        return _Limits.usual if _Limits.blocks and not self.depth and now == _Limits.last else now
+
+    def begin(self, count: int) -> int:
+        """Set the number of this thread; return what it has to be `end`ed with."""
+        with self.lock:
+            before = self.usual_here()
+            if not _Limits.blocks:
+                _Limits.usual = before
+            _Limits.blocks, self.depth = _Limits.blocks + 1, self.depth + 1
+            _Limits.last = min(count, before) if _forked else count
+            torch.set_num_threads(_Limits.last)
+        return before
+
+    def end(self, before: int) -> None:
+        with self.lock:
+            _Limits.blocks, self.depth = _Limits.blocks - 1, self.depth - 1
+            torch.set_num_threads(before)
+
+
+_limits = _Limits()
+
+
 @contextmanager
 def _torch_threads(count: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(min(count, before) if _forked else count)
+    before = _limits.begin(count)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        _limits.end(before)
 
 
 def side_by_side(function: Callable[[Item], Result], items: Sequence[Item], threads: int) -> Iterator[Result]:

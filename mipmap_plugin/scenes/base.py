@@ -33,7 +33,7 @@ STRETCHED = "stretched"
 SHAPE_TOLERANCE = 0.1
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Scene:
     """The scene at one path. Cameras without an image are usable views: adaptation needs no photographs.
 
@@ -60,6 +60,10 @@ class Scene:
     lenses: dict[Path, Lens] = field(default_factory=dict)
     numbers: tuple[int, ...] = ()
     as_4dgaussians: bool = False
+
+    def __repr__(self) -> str:
+        views = f"{len(self.cameras)} of {sizes_of(self.cameras)}" if self.cameras else "none"
+        return f"<Scene: cameras {views}, photographs {len(self.images)}, from {self.source}>"
 
     def digest(self) -> str:
         """A hash of the cameras and of the photographs: of their names and sizes in bytes, not of what they show."""

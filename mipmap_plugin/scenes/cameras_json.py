@@ -11,7 +11,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from mipmap_plugin.camera import Camera, viewmat_of
+from mipmap_plugin.camera import Camera, checked, viewmat_of
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.json_file import MAX_SIDE, numbers, pixels, positive, present, read_json, rotation
@@ -61,8 +61,9 @@ def write_cameras(path: str | Path, cameras: Sequence[Camera], *, overwrite: boo
     """Write `cameras` as INRIA does, test views first; return the path. Raises OutputExists.
 
     A principal point off the image center is written as cx and cy, which INRIA's readers do not know and some descendants do.
+    Raises SettingsError for anything else than cameras.
     """
-    ordered = sorted(cameras, key=lambda camera: camera.split != "test")
+    ordered = sorted(checked(cameras), key=lambda camera: camera.split != "test")
     path = path_of(path)
     write_json(path, [_entry(index, camera) for index, camera in enumerate(ordered)], overwrite)
     return path

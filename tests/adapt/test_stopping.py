@@ -87,6 +87,57 @@ def test_a_second_ctrl_c_is_immediate_and_the_old_handler_comes_back(slowly):
     assert signal.getsignal(signal.SIGINT) is before
 
 
+@pytest.fixture
+def handled_by():
+    """Return a function that sets a program's own handler of Ctrl-C, which is undone after the test."""
+    before = signal.getsignal(signal.SIGINT)
+    yield lambda handler: signal.signal(signal.SIGINT, handler)
+    signal.signal(signal.SIGINT, before)
+
+
+def test_ctrl_c_is_told_to_the_program_s_own_handler(handled_by, ctrl_c):
+    """Which decides: a training that ends after its iteration, or a server."""
+    heard = []
+    handled_by(lambda number, frame: heard.append(number))
+    ctrl_c(3)
+    report = wrapped().adapt(1 / 4, **BRIEF).report
+    assert (heard, report.ended_by) == ([signal.SIGINT], f"{BRIEF['steps']} steps")
+
+
+def test_a_handler_that_interrupts_does_so_between_two_steps(handled_by, ctrl_c, tmp_path):
+    def interrupt(number, frame):
+        raise KeyboardInterrupt
+
+    handled_by(interrupt)
+    ctrl_c(3)
+    with pytest.raises(Interrupted, match="interrupted at step 3; run the same command again to continue"):
+        wrapped().adapt(1 / 4, resume=tmp_path / "run.resume", **BRIEF)
+    assert signal.getsignal(signal.SIGINT) is interrupt
+
+
+def test_ctrl_c_that_a_program_ignores_stays_ignored(handled_by, ctrl_c):
+    """Workers of a pool, and what a script starts in the background."""
+    handled_by(signal.SIG_IGN)
+    ctrl_c(3)
+    assert wrapped().adapt(1 / 4, **BRIEF).report.ended_by == f"{BRIEF['steps']} steps"
+
+
+def test_a_command_that_ignores_ctrl_c_can_be_told_to_end(handled_by):
+    handled_by(signal.SIG_IGN)
+    with signals.ends_as_by_ctrl_c(), interruptible() as interrupted:
+        signal.raise_signal(signal.SIGTERM)
+        assert interrupted()
+
+
+@pytest.mark.parametrize("handler", [signal.SIG_DFL, None])
+def test_a_handler_that_python_could_not_call_is_left_alone(handler, monkeypatch):
+    """None is what Python says of one that another language has set."""
+    monkeypatch.setattr(signal, "getsignal", lambda number: handler)
+    monkeypatch.setattr(signal, "signal", lambda *_: pytest.fail("the handler was replaced"))
+    with interruptible() as interrupted:
+        assert not interrupted()
+
+
 def test_adapting_in_a_thread():
     done = []
     thread = threading.Thread(target=lambda: done.append(wrapped().adapt(1 / 4, steps=1, extra_views=0)))

@@ -93,6 +93,9 @@ def test_shapes_are_checked():
         "quats": ({**raw, "quats": raw["quats"][:2]}, "quats: expected shape"),
         "shN": ({**raw, "shN": raw["shN"][:, :7]}, "7 coefficients fit no SH degree"),
         "missing": ({"means": raw["means"]}, "expected means, scales"),
+        "array": ({**raw, "sh0": raw["sh0"].numpy()}, "sh0: expected a torch tensor, got ndarray"),
+        "number": ({**raw, "means": torch.tensor(0.0)}, r"means: expected shape \[0, 3\], got \[\]"),
+        "device": ({**raw, "sh0": raw["sh0"].to("meta")}, "sh0: it is on meta, but means are on cpu; move all to one device"),
     }.values():
         with pytest.raises(ShapeError, match=sentence):
             VanillaModel(broken)
