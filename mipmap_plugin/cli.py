@@ -37,6 +37,9 @@ DESCRIPTION = (
     "and --log FILE, to append all that is said, with further details, to a file. mipmap-plugin --version tells the version."
 )
 
+# An option that is not given is None; nobody types that, and help does not offer it.
+OPTIONS = (tyro.conf.DisallowNone,)
+
 COMMANDS = {command.__name__.rstrip("_"): command for command in (inspect, adapt, levels, render, view, evaluate, tradeoff, backends, list_, demo)}
 
 
@@ -54,6 +57,16 @@ def _alone(command: Callable[..., None]) -> Callable[..., None]:
 app = tyro.extras.SubcommandApp()
 for name, command in COMMANDS.items():
     app.command(name=name)(_alone(command))
+
+
+def _parse(words: Sequence[str]) -> None:
+    """Run the command that the words name, or print help. Each command has a parser of its own, so that what is said of a mistake points to the
+    command's own help, and suggests no option of another command."""
+    if words and (command := COMMANDS.get(words[0])):
+        refuse_repeated(command, words)
+        tyro.cli(_alone(command), prog=f"mipmap-plugin {words[0]}", args=words[1:], config=OPTIONS)
+    else:
+        app.cli(prog="mipmap-plugin", description=DESCRIPTION, args=words, config=OPTIONS)
 
 
 def _at_home(word: str) -> str:
@@ -87,9 +100,7 @@ def _run(words: Sequence[str]) -> int:
     with ends_as_by_ctrl_c() as ending:
         try:
             with _our_warnings_only():
-                if words and words[0] in COMMANDS:
-                    refuse_repeated(COMMANDS[words[0]], words)
-                app.cli(prog="mipmap-plugin", description=DESCRIPTION, args=words)
+                _parse(words)
         except KeyboardInterrupt as interrupt:
             voice.complain(f"\nmipmap-plugin: {str(interrupt) or 'interrupted'}")
             return ending.code

@@ -19,7 +19,6 @@ from pathlib import Path
 import pytest
 import tiny
 import torch
-import tyro
 
 import mipmap_plugin
 from mipmap_plugin import cli, wrap_model
@@ -163,10 +162,7 @@ def parse(monkeypatch):
 
         return record
 
-    app = tyro.extras.SubcommandApp()
-    for name, command in COMMANDS.items():
-        app.command(recorder(name, command))
-    monkeypatch.setattr(cli, "app", app)
+    monkeypatch.setattr(cli, "COMMANDS", {name: recorder(name, command) for name, command in COMMANDS.items()})
 
     def call(words):
         calls.clear()

@@ -12,7 +12,7 @@ import tiny
 from commands_run import NO_STEP, QUICK, refused
 
 from mipmap_plugin.cli import COMMANDS
-from mipmap_plugin.commands.types import read_scale
+from mipmap_plugin.commands.types import read_scale, read_viewer
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
@@ -140,6 +140,25 @@ def test_an_output_below_a_file_ends_in_one_sentence(run, tmp_path):
 def test_words_that_are_not_understood_exit_with_2(run, words):
     code, _, err = run(*words.split())
     assert code == 2 and "Traceback" not in err
+
+
+@pytest.mark.parametrize("words", ["adapt --scale 25%", "adapt --viewers spark", "adapt --up up", "levels a b"])
+def test_a_mistake_points_to_the_help_of_its_command(run, words):
+    command = words.split()[0]
+    said = run(*words.split())[2]
+    assert f"mipmap-plugin {command} --help" in said
+    assert [other for other in COMMANDS if other != command and f"mipmap-plugin {other}" in said] == []
+
+
+def test_every_command_that_takes_a_checkpoint_has_an_example(run):
+    for name, command in COMMANDS.items():
+        if {"checkpoint", "checkpoints"} & {*inspect.signature(command).parameters}:
+            assert f"Example: mipmap-plugin {name} " in run(name, "--help")[1]
+
+
+@pytest.mark.parametrize(("text", "name"), [("SuperSplat", "supersplat"), ("Luma", "luma"), ("spark", "spark"), ("Sparky", "Sparky")])
+def test_viewers_are_named_as_their_makers_write_them_too(text, name):
+    assert read_viewer(text) == name
 
 
 @pytest.mark.parametrize(("text", "scale"), [("1/4", 0.25), ("4", 4.0), ("1e-3", 0.001), ("1 / 4", 0.25), ("×1/4", 0.25), ("0.25x", 0.25)])
