@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from functools import wraps
 from importlib.metadata import version
+from inspect import getdoc
 from typing import Any
 
 import tyro
@@ -42,6 +43,20 @@ OPTIONS = (tyro.conf.DisallowNone,)
 
 COMMANDS = {command.__name__.rstrip("_"): command for command in (inspect, adapt, levels, render, view, evaluate, tradeoff, backends, list_, demo)}
 
+# What the help of each command shows, behind its name.
+EXAMPLES = {
+    "inspect": "output/bicycle",
+    "adapt": "output/bicycle --scale 1/4 --viewer supersplat",
+    "levels": "output/bicycle --viewer supersplat --output output/bicycle_levels",
+    "render": "output/bicycle --scale 1/4 --output pictures",
+    "view": "output/bicycle output/bicycle_x0.25_supersplat",
+    "evaluate": "output/bicycle --images data/bicycle --scale 1/4 --recipe default",
+    "tradeoff": "output/bicycle --images data/bicycle --scale 1/8 --output tradeoff",
+    "backends": "--check cpu",
+    "list": "viewers",
+    "demo": "--viewer spark",
+}
+
 
 def _alone(command: Callable[..., None]) -> Callable[..., None]:
     """The command, while which nothing else prints to standard output (`voice.alone`); its help, which tyro prints, comes before."""
@@ -64,7 +79,9 @@ def _parse(words: Sequence[str]) -> None:
     command's own help, and suggests no option of another command."""
     if words and (command := COMMANDS.get(words[0])):
         refuse_repeated(command, words)
-        tyro.cli(_alone(command), prog=f"mipmap-plugin {words[0]}", args=words[1:], config=OPTIONS)
+        prog, summary = f"mipmap-plugin {words[0]}", (getdoc(command) or "").partition("\n\nArgs:")[0]
+        described = f"{summary}\n\nExample: {prog} {EXAMPLES[words[0]]}"
+        tyro.cli(_alone(command), prog=prog, description=described, args=words[1:], config=OPTIONS)
     else:
         app.cli(prog="mipmap-plugin", description=DESCRIPTION, args=words, config=OPTIONS)
 

@@ -73,6 +73,7 @@ def shell_pieces(page: Path) -> list[Piece]:
 
 
 SHELL = [piece for page in PAGES for piece in shell_pieces(page)]
+HELP = [Piece(ROOT / "mipmap_plugin/cli.py", f"mipmap-plugin {name} {words}") for name, words in cli.EXAMPLES.items()]
 CALLS = list({piece.text: piece for piece in SHELL if piece.text.startswith("mipmap-plugin ")}.values())
 PYTHON = [Piece(page, block) for page in PAGES for block in blocks(page, python=True) if not SNIPPET.search(block)]
 
@@ -177,7 +178,7 @@ def is_mention(words: list[str]) -> bool:
     return len(words) == 1 and words[0] in COMMANDS
 
 
-@pytest.mark.parametrize("call", CALLS, ids=str)
+@pytest.mark.parametrize("call", [*HELP, *CALLS], ids=str)
 def test_commands_parse(call, parse):
     words = shlex.split(call.text)[1:]
     if is_mention(words):

@@ -75,8 +75,6 @@ def adapt(
 ) -> None:
     """Make a checkpoint that looks right at another scale, in the viewer that it is opened in.
 
-    Example: mipmap-plugin adapt output/bicycle --scale 1/4 --viewer supersplat
-
     Args:
         checkpoints: A PLY, .spz, .sog, .splat or .glb, or a model folder; or several, also as patterns such as 'output/*'.
         scale: Target focal length over base focal length, such as 1/4 or 4; may be given several times. Required without --splats or --bytes.

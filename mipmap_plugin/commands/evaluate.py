@@ -54,8 +54,6 @@ def evaluate(
 ) -> None:
     """Evaluate checkpoints against real images: as they are, with training-free filters, resized, and adapted.
 
-    Example: mipmap-plugin evaluate output/bicycle --images data/bicycle --scale 1/4 --recipe default
-
     Args:
         checkpoint: A PLY or a model folder; its cameras, or those given, define the base scale. Required; several scenes are also averaged.
         images: Folder of the scene (transforms_*.json or COLMAP's sparse/0, and the images), one for each checkpoint.

@@ -31,8 +31,6 @@ def inspect(
 ) -> None:
     """Say whether a checkpoint is sound, what it is, which effects it needs, and what is wrong with it.
 
-    Example: mipmap-plugin inspect output/bicycle
-
     Args:
         checkpoint: A PLY, .spz, .sog, .splat or .glb, or a model folder.
         iteration: Which iteration of a model folder; by default the newest.

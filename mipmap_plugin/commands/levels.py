@@ -39,8 +39,6 @@ def levels(
 ) -> None:
     """Make a ladder of levels: files of one scene for every zoom, of which a viewer shows the one that fits.
 
-    Example: mipmap-plugin levels output/bicycle --viewer supersplat --output output/bicycle_levels
-
     Args:
         checkpoint: A PLY, .spz, .sog, .splat or .glb, or a model folder.
         viewer: Viewer to make the levels for: spark, supersplat, classic, ... An unknown name lists all.

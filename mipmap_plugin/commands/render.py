@@ -50,8 +50,6 @@ def render(
 ) -> None:
     """Render views of a checkpoint as PNG files, optionally with depth and normals.
 
-    Example: mipmap-plugin render output/bicycle --scale 1/4 --output pictures
-
     Args:
         checkpoint: A PLY, .spz, .sog, .splat or .glb, or a model folder.
         output: The folder for the pictures.

@@ -52,8 +52,6 @@ def tradeoff(
 
     Writes tradeoff.json, tradeoff.csv and tradeoff.png. Models are evaluated on views that they were not adapted to, outside the time counted.
 
-    Example: mipmap-plugin tradeoff output/bicycle --images data/bicycle --scale 1/8 --output tradeoff
-
     Args:
         checkpoint: A PLY, .spz, .sog, .splat or .glb, or a model folder.
         scale: Target focal length over base focal length, such as 1/8 or 4. Required; may be given several times.
@@ -77,7 +75,6 @@ def tradeoff(
     from mipmap_plugin.evaluation.tradeoff.files import KEPT, Folder, refuse
     from mipmap_plugin.evaluation.tradeoff.points import Plan
     from mipmap_plugin.evaluation.tradeoff.run import run
-
     refuse(folder := Folder(output, picture, overwrite))
     page = tradeoff_page_path(output, overwrite) if report else None
     plan = Plan(recipe or ("default", "paper"), steps, backend or ("auto",), supersampling or (2, 4, 8), renderers, repeats, seed, viewer)

@@ -46,8 +46,6 @@ def view(
 ) -> None:
     """Show a checkpoint in the browser at any zoom, beside adapted files and levels, and adapt it for what is on the screen.
 
-    Example: mipmap-plugin view output/bicycle output/bicycle_x0.25_supersplat
-
     Args:
         checkpoint: A PLY, .spz, .sog, .splat or .glb, or a model folder: the base.
         adapted: Files adapted from it, and folders of levels, to switch to.
