@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from functools import wraps
 from importlib.metadata import version
+from inspect import getdoc
 from typing import Any
 
 import tyro
@@ -38,7 +39,24 @@ DESCRIPTION = (
     "and --log FILE, to append all that is said, with further details, to a file. mipmap-plugin --version tells the version."
 )
 
+# An option that is not given is None; nobody types that, and help does not offer it.
+OPTIONS = (tyro.conf.DisallowNone,)
+
 COMMANDS = {command.__name__.rstrip("_"): command for command in (inspect, adapt, levels, render, view, evaluate, tradeoff, backends, list_, demo)}
+
+# What the help of each command shows, behind its name.
+EXAMPLES = {
+    "inspect": "output/bicycle",
+    "adapt": "output/bicycle --scale 1/4 --viewer supersplat",
+    "levels": "output/bicycle --viewer supersplat --output output/bicycle_levels",
+    "render": "output/bicycle --scale 1/4 --output pictures",
+    "view": "output/bicycle output/bicycle_x0.25_supersplat",
+    "evaluate": "output/bicycle --images data/bicycle --scale 1/4 --recipe default",
+    "tradeoff": "output/bicycle --images data/bicycle --scale 1/8 --output tradeoff",
+    "backends": "--check cpu",
+    "list": "viewers",
+    "demo": "--viewer spark",
+}
 
 
 def _alone(command: Callable[..., None]) -> Callable[..., None]:
@@ -55,6 +73,20 @@ def _alone(command: Callable[..., None]) -> Callable[..., None]:
 app = tyro.extras.SubcommandApp()
 for name, command in COMMANDS.items():
     app.command(name=name)(_alone(command))
+
+
+def _parse(words: Sequence[str]) -> None:
+    """Run the command that the words name, or print help. Each command has a parser of its own, so that what is said of a mistake points to the
+    command's own help, and suggests no option of another command."""
+    if any(not word or re.fullmatch("--[^=]+=", word) for word in words):  # "" would be a path, to this folder
+        raise SettingsError("a word of this command is empty, as where a variable of the shell is not set; fill it in, or leave it out")
+    if words and (command := COMMANDS.get(words[0])):
+        refuse_repeated(command, words)
+        prog, summary = f"mipmap-plugin {words[0]}", (getdoc(command) or "").partition("\n\nArgs:")[0]
+        described = f"{summary}\n\nExample: {prog} {EXAMPLES[words[0]]}"
+        tyro.cli(_alone(command), prog=prog, description=described, args=words[1:], config=OPTIONS)
+    else:
+        app.cli(prog="mipmap-plugin", description=DESCRIPTION, args=words, config=OPTIONS)
 
 
 def _at_home(word: str) -> str:
@@ -88,11 +120,7 @@ def _run(words: Sequence[str]) -> int:
     with ends_as_by_ctrl_c() as ending:
         try:
             with _our_warnings_only():
-                if any(not word or re.fullmatch("--[^=]+=", word) for word in words):  # "" would be a path, to this folder
-                    raise SettingsError("a word of this command is empty, as where a variable of the shell is not set; fill it in, or leave it out")
-                if words and words[0] in COMMANDS:
-                    refuse_repeated(COMMANDS[words[0]], words)
-                app.cli(prog="mipmap-plugin", description=DESCRIPTION, args=words)
+                _parse(words)
         except KeyboardInterrupt as interrupt:
             voice.complain(f"\nmipmap-plugin: {str(interrupt) or 'interrupted'}")
             return ending.code

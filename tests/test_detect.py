@@ -144,6 +144,23 @@ def test_a_capture_in_lcc_is_converted_first(tmp_path):
         detect(tmp_path / "hall.lcc")
 
 
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("walk.MOV", "is a photograph or a video, not a trained scene; train one on it first"),
+        ("IMG_1.jpg", "is a photograph or a video, not a trained scene; train one on it first"),
+        ("chair.obj", "is a mesh or a plain point cloud, not Gaussian splats"),
+        ("transforms_train.json", "holds cameras, not splats; give the checkpoint, and this file by --cameras"),
+        ("notes.txt", "no checkpoint that is known here; give a PLY, .spz, .sog, .splat or .glb, or a model folder"),
+    ],
+)
+def test_what_is_given_in_place_of_a_trained_scene(tmp_path, name, told):
+    """Text of 32 bytes a line, which has the size of whole records of a .splat, and numbers that could be of one."""
+    (tmp_path / name).write_text("v 0.125 0.250 0.375 0.5 0.5 0.5\n" * 3)
+    with pytest.raises(CheckpointError, match=f"{name} {told}" if "known" not in told else told):
+        detect(tmp_path / name)
+
+
 def test_point_cloud_is_not_a_splat(tmp_path):
     write(tmp_path / "points3D.ply", f4("x", "y", "z", "red", "green", "blue"))
     with pytest.raises(CheckpointError, match="plain point cloud or a mesh"):

@@ -9,8 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 
 import pytest
-import tyro
-from docs_pages import CALLS, COMMANDS, PAGES, ROOT, SHELL, SNIPPET, blocks, is_mention, prose
+from docs_pages import CALLS, COMMANDS, PAGES, ROOT, SHELL, SNIPPET, Piece, blocks, is_mention, prose
 
 import mipmap_plugin
 from mipmap_plugin import cli, wrap_model
@@ -32,6 +31,9 @@ OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]*")
 
 OTHER_PROGRAMS = {"pip", "python", "pytest", "ruff", "mypy", "npm", "mkdocs", "dask", "sbatch"}
 OPTIONS_OF_OTHERS = {"--train_test_exp", "--antialiasing", "--resources"}  # INRIA's; dask's
+
+
+HELP = [Piece(ROOT / "mipmap_plugin/cli.py", f"mipmap-plugin {name} {words}") for name, words in cli.EXAMPLES.items()]
 
 
 def test_the_readme_is_read_in_two_minutes():
@@ -113,10 +115,7 @@ def parse(monkeypatch):
 
         return record
 
-    app = tyro.extras.SubcommandApp()
-    for name, command in COMMANDS.items():
-        app.command(recorder(name, command))
-    monkeypatch.setattr(cli, "app", app)
+    monkeypatch.setattr(cli, "COMMANDS", {name: recorder(name, command) for name, command in COMMANDS.items()})
 
     def call(words):
         calls.clear()
@@ -126,7 +125,7 @@ def parse(monkeypatch):
     return call
 
 
-@pytest.mark.parametrize("call", CALLS, ids=str)
+@pytest.mark.parametrize("call", [*HELP, *CALLS], ids=str)
 def test_commands_parse(call, parse):
     words = shlex.split(call.text)[1:]
     if is_mention(words):

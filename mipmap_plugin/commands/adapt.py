@@ -15,7 +15,7 @@ from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.pages import AdaptationPage, look_at
 from mipmap_plugin.commands.terminal_picture import show_before_and_after
 from mipmap_plugin.commands.tiled import adapt_tiled
-from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoints, Scale, ScreenFilter, Seed, Threads, Up, unique_scales
+from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoints, Scale, ScreenFilter, Seed, Threads, Up, Viewer, unique_scales
 from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
 from mipmap_plugin.errors import SettingsError
@@ -56,7 +56,7 @@ def adapt(
     scale: tyro.conf.UseAppendAction[tuple[Scale, ...]] = (),
     output: Path | None = None,
     recipe: str = "default",
-    viewer: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    viewer: tyro.conf.UseAppendAction[tuple[Viewer, ...]] = (),
     cameras: Cameras = None,
     up: Up = None,
     splats: int | None = None,
@@ -76,7 +76,7 @@ def adapt(
     """Make a checkpoint that looks right at another scale, in the viewer that it is opened in.
 
     Args:
-        checkpoints: A PLY or a model folder, or several; patterns such as 'output/*' too.
+        checkpoints: A PLY, .spz, .sog, .splat or .glb, or a model folder; or several, also as patterns such as 'output/*'.
         scale: Target focal length over base focal length, such as 1/4 or 4; may be given several times. Required without --splats or --bytes.
         output: Where to write; by default beside the checkpoint, as NAME_x0.25. With several scales or viewers: a folder for all files.
         recipe: default; thorough (more steps and views); instant (closed form only, seconds); paper (the published method); or a registered one.

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import tyro
 
-from mipmap_plugin.commands.types import Scale, unique_scales
+from mipmap_plugin.commands.types import Scale, Viewer, unique_scales
 from mipmap_plugin.commands.voice import detail, say
 
 
 def demo(
     output: Path = Path("mipmap-demo"),
     scale: tyro.conf.UseAppendAction[tuple[Scale, ...]] = (),
-    viewer: str | None = None,
+    viewer: Viewer | None = None,
     report: bool = True,
     overwrite: bool = False,
 ) -> None:

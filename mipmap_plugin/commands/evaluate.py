@@ -13,7 +13,7 @@ import tyro
 from mipmap_plugin.commands.common import print_json, scene, without_none, wrap
 from mipmap_plugin.commands.pages import evaluation_gallery, evaluation_page_path, look_at, write_evaluation_page
 from mipmap_plugin.commands.resuming import resumable, resume_path
-from mipmap_plugin.commands.types import BackendName, Background, Scales, ScreenFilter, Seed, Threads, unique_scales
+from mipmap_plugin.commands.types import BackendName, Background, Scales, ScreenFilter, Seed, Threads, Viewer, unique_scales
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.config import ResizeFilter
 from mipmap_plugin.errors import SettingsError, plural
@@ -31,7 +31,7 @@ def evaluate(
     images: tuple[Path, ...],
     scale: Scales,
     recipe: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
-    viewer: str | None = None,
+    viewer: Viewer | None = None,
     protocol: Literal["P1", "P3", "P4"] = "P3",
     lpips: Literal["alex", "vgg", "vgg-01"] | None = None,
     lpips_weights: Path | None = None,

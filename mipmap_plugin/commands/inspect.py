@@ -32,7 +32,7 @@ def inspect(
     """Say whether a checkpoint is sound, what it is, which effects it needs, and what is wrong with it.
 
     Args:
-        checkpoint: A PLY or a model folder.
+        checkpoint: A PLY, .spz, .sog, .splat or .glb, or a model folder.
         iteration: Which iteration of a model folder; by default the newest.
         viewers: Render a few views as web viewers do, and report their PSNR against renders with the filter of the training.
         all: Also list the effects that are off, with reasons. The JSON always has them.

@@ -7,7 +7,7 @@ from pathlib import Path
 from mipmap_plugin.commands.common import without_none, wrap
 from mipmap_plugin.commands.ladders import Exports, print_summary, saved
 from mipmap_plugin.commands.outputs import folder_of_several
-from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, Scale, ScreenFilter, Seed, Threads, Up, Way
+from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, Scale, ScreenFilter, Seed, Threads, Up, Viewer, Way
 from mipmap_plugin.config import ViewPolicy
 from mipmap_plugin.formats.splat_transform import WRITTEN
 from mipmap_plugin.jobs.base import Base
@@ -15,7 +15,7 @@ from mipmap_plugin.jobs.base import Base
 
 def levels(
     checkpoint: Checkpoint,
-    viewer: str,
+    viewer: Viewer,
     output: Path,
     coarsest: Scale = 1 / 16,
     ratio: float | None = None,
@@ -42,7 +42,7 @@ def levels(
     """Make a ladder of levels: files of one scene for every zoom, of which a viewer shows the one that fits.
 
     Args:
-        checkpoint: A PLY or a model folder.
+        checkpoint: A PLY, .spz, .sog, .splat or .glb, or a model folder.
         viewer: Viewer to make the levels for: spark, supersplat, classic, ... An unknown name lists all.
         output: Folder for the levels, a report beside each, and levels.json, which says when each is to be shown.
         coarsest: Zoom down to which levels are made; below it the last level is shown.

@@ -12,7 +12,7 @@ import tyro
 
 from mipmap_plugin.commands.common import base_cameras, wrap
 from mipmap_plugin.commands.outputs import picture_names
-from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, OwnScale, Up
+from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, OwnScale, Up, Viewer
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError, plural
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
@@ -36,7 +36,7 @@ def render(
     view: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     time: tyro.conf.UseAppendAction[tuple[float, ...]] = (),
     screen_filter: Literal["trained", "scaled"] | Name = "trained",
-    viewer: str | None = None,
+    viewer: Viewer | None = None,
     supersampling: int = 1,
     filter_3d: bool = False,
     depth: bool = False,
@@ -51,7 +51,7 @@ def render(
     """Render views of a checkpoint as PNG files, optionally with depth and normals.
 
     Args:
-        checkpoint: A PLY or a model folder.
+        checkpoint: A PLY, .spz, .sog, .splat or .glb, or a model folder.
         output: The folder for the pictures.
         scale: Zoom, relative to the cameras; by default the scale that the file was adapted to, or else 1.
         view: Name of a view; may be given several times. By default all test views, or all if there are none.

@@ -13,7 +13,7 @@ from mipmap_plugin.commands.common import print_json, scene, without_none, wrap
 from mipmap_plugin.commands.outputs import folder_of_several
 from mipmap_plugin.commands.pages import look_at, tradeoff_page_path, write_tradeoff_page
 from mipmap_plugin.commands.resuming import resumable
-from mipmap_plugin.commands.types import Background, Cameras, Checkpoint, Scales, ScreenFilter, Up, unique_scales
+from mipmap_plugin.commands.types import Background, Cameras, Checkpoint, Scales, ScreenFilter, Up, Viewer, unique_scales
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.recipes import recipe as make_config
@@ -31,7 +31,7 @@ def tradeoff(
     output: Path,
     images: Path | None = None,
     recipe: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
-    viewer: str | None = None,
+    viewer: Viewer | None = None,
     steps: tyro.conf.UseAppendAction[tuple[int, ...]] = (),
     backend: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     supersampling: tyro.conf.UseAppendAction[tuple[int, ...]] = (),
@@ -54,7 +54,7 @@ def tradeoff(
     Writes tradeoff.json, tradeoff.csv and tradeoff.png. Models are evaluated on views that they were not adapted to, outside the time counted.
 
     Args:
-        checkpoint: A PLY or a model folder.
+        checkpoint: A PLY, .spz, .sog, .splat or .glb, or a model folder.
         scale: Target focal length over base focal length, such as 1/8 or 4. Required; may be given several times.
         output: The folder for the results.
         images: Folder of the scene with real images (protocol P3). Without it the base itself is the truth; every axis and table says which.

@@ -33,6 +33,14 @@ def unique_scales(scales: Sequence[float]) -> list[float]:
     return list(dict.fromkeys(scales))
 
 
+def read_viewer(text: str) -> str:
+    """The name of a viewer, which people write as its makers do, such as SuperSplat; a name that is not known is left as it is."""
+    from mipmap_plugin.splatting.viewers import NO_RECORD, VIEWERS
+
+    names = {*VIEWERS.names(), *NO_RECORD}
+    return text if text in names or text.lower() not in names else text.lower()
+
+
 _SCALE = tyro.constructors.PrimitiveConstructorSpec[Any](
     nargs=1,
     metavar="1/4|4",
@@ -40,6 +48,14 @@ _SCALE = tyro.constructors.PrimitiveConstructorSpec[Any](
     is_instance=lambda value: value is None or isinstance(value, float),
     str_from_instance=lambda value: [f"{value:g}" if value else "its own"],
 )
+_VIEWER = tyro.constructors.PrimitiveConstructorSpec[str](
+    nargs=1,
+    metavar="NAME",
+    instance_from_str=lambda words: read_viewer(words[0]),
+    is_instance=lambda value: isinstance(value, str),
+    str_from_instance=lambda value: [value],
+)
+Viewer = Annotated[str, _VIEWER]
 Scale = Annotated[float, _SCALE]
 OwnScale = Annotated[float | None, _SCALE]  # None: that of the file
 Scales = tyro.conf.UseAppendAction[list[Scale]]
@@ -49,11 +65,10 @@ Checkpoints = tyro.conf.Positional[tuple[Path, ...]]
 
 # Options that several commands have, with what their help says.
 Cameras = Annotated[
-    Path | None, tyro.conf.arg(help="A cameras.json, a transforms file or a COLMAP scene, if there are no cameras beside the checkpoint.")
+    Path | None,
+    tyro.conf.arg(help="A cameras.json, a transforms file or a COLMAP scene, in place of the checkpoint's own cameras; a lone file has none."),
 ]
-Background = Annotated[
-    Literal["white", "black"] | None, tyro.conf.arg(help="Of the scene; by default that of the checkpoint, or else black.")
-]
+Background = Annotated[Literal["white", "black"] | None, tyro.conf.arg(help="Of the scene; by default that of the checkpoint, or else black.")]
 ScreenFilter = Annotated[
     TrainedName | None,
     tyro.conf.arg(

@@ -14,7 +14,7 @@ import tyro
 
 from mipmap_plugin.commands.common import base_cameras, wrap
 from mipmap_plugin.commands.outputs import adapted_path
-from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, ScreenFilter, Up
+from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, ScreenFilter, Up, Viewer
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_unwritable
@@ -32,7 +32,7 @@ DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 def view(
     checkpoint: Checkpoint,
     adapted: tyro.conf.Positional[tuple[Path, ...]] = (),
-    viewer: str | None = None,
+    viewer: Viewer | None = None,
     output: Path | None = None,
     cameras: Cameras = None,
     up: Up = None,
@@ -47,7 +47,7 @@ def view(
     """Show a checkpoint in the browser at any zoom, beside adapted files and levels, and adapt it for what is on the screen.
 
     Args:
-        checkpoint: A PLY or a model folder: the base.
+        checkpoint: A PLY, .spz, .sog, .splat or .glb, or a model folder: the base.
         adapted: Files adapted from it, and folders of levels, to switch to.
         viewer: Viewer whose drawing is shown first: classic, spark, playcanvas (or supersplat), ... An unknown name lists all viewers.
         output: Folder for what the page's button saves; by default beside the checkpoint. Nothing is overwritten.

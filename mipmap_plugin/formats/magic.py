@@ -132,12 +132,12 @@ def _kind_of_zip(path: Path) -> str:
 
 
 def _plausible_splat(head: bytes, size: int, named: bool) -> bool:
-    """Whether the file consists of complete records with values that are plausible for splats.
+    """Whether the file consists of complete records with values that are plausible for splats, and is no text, such as a mesh in an .obj.
 
     `named`: it is called .splat. Then quaternions may be of any length, as converters of point clouds write them, whose round splats look
     alike however they are turned, and sizes may be 0.
     """
-    if size % SPLAT_RECORD.itemsize:
+    if size % SPLAT_RECORD.itemsize or head.isascii():
         return False
     rows = np.frombuffer(head[: len(head) // SPLAT_RECORD.itemsize * SPLAT_RECORD.itemsize], SPLAT_RECORD)
     scale = rows["scale"]

@@ -19,6 +19,17 @@ from mipmap_plugin.models.zipped_folder import opened, retold, told
 EXCHANGED, PHOTOGRAPHS = (".spz", ".sog", ".splat", ".ksplat", ".glb", ".gltf"), (".jpg", ".jpeg", ".png")
 OWN_SUFFIXES = (".ply", ".pt", ".ckpt", *EXCHANGED)
 
+# What else people give, by its suffix: what it is, and what to do.
+OTHERS = {
+    **dict.fromkeys((*PHOTOGRAPHS, ".mp4", ".mov"), "a photograph or a video, not a trained scene; train one on it first, and give that"),
+    **dict.fromkeys((".obj", ".fbx", ".stl", ".las", ".laz"), "a mesh or a plain point cloud, not Gaussian splats; give a trained model"),
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "USD, which is not read here; export a PLY from the program that made it"),
+    ".ssproj": "a project of SuperSplat, which moves and tints its splats; open it there and export a PLY",
+    ".npz": "a NumPy archive that no family knows; give a PLY file or a model folder, or register its family",
+    ".hier": "a hierarchy of Hierarchical 3D Gaussians, whose splats follow the distance, which is not read here; "
+    "give the PLY of one of its chunks (trained_chunks/<name>/point_cloud/iteration_<N>)",
+}
+
 # The families of this package.
 OWN = frozenset(family.name for family in BUILT_IN)
 
@@ -130,26 +141,21 @@ def _why_not(files: Files) -> str:
         return f"{path} is a torch file that holds no known checkpoint; give a PLY file or a model folder"
     if kind == "unknown" and path.suffix.lower() in (".ply", *EXCHANGED):
         return f"{path} is damaged, cut off or no {path.suffix.lower()} file; download or export it again"
-    if path.suffix == ".npz":
-        return f"{path} is a NumPy archive that no family knows; give a PLY file or a model folder, or register its family"
     if path.suffix.lower() in (".lcc", ".lcc2"):
         return f"{path} is LCC of XGRIDS, which is not read here; convert it: splat-transform {path.name} {path.stem}.ply"
-    if path.suffix.lower() in (".usd", ".usda", ".usdc", ".usdz"):
-        return f"{path} is USD, which is not read here; export a PLY from the program that made it"
+    if other := OTHERS.get(path.suffix.lower()):
+        return f"{path} is {other}"
     if kind == "3d-tiles":
         return f"{path} is the tileset of 3D Tiles; give one of its tiles (.glb)"
-    if path.suffix.lower() == ".ssproj":
-        return f"{path} is a project of SuperSplat, which moves and tints its splats; open it there and export a PLY"
-    if path.suffix == ".hier":
-        chunk = "the PLY of one of its chunks (trained_chunks/<name>/point_cloud/iteration_<N>)"
-        return f"{path} is a hierarchy of Hierarchical 3D Gaussians, whose splats follow the distance, which is not read here; give {chunk}"
     if kind == "unknown" and _is_whole(path.parent):  # as nerfstudio's commands take the config.yml
         return f"{path} is one file of a model folder; give the folder, {path.parent}"
+    if path.match("*transforms*.json") or path.name == "cameras.json":
+        return f"{path} holds cameras, not splats; give the checkpoint, and this file by --cameras (cameras=)"
     return {
         "torchscript": f"{path} is a TorchScript network, one companion of an anchor model; give the model folder that holds its point_cloud.ply",
         "zip": f"{path} is a zip archive; unpack it and give the PLY or the folder in it",
         "gzip": f"{path} is a gzip file; unpack it first",
-    }.get(kind, f"{path} is no checkpoint that is known here; give a PLY file or a model folder")
+    }.get(kind, f"{path} is no checkpoint that is known here; give a PLY, .spz, .sog, .splat or .glb, or a model folder")
 
 
 def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:

@@ -11,8 +11,8 @@ import pytest
 import tiny
 from commands_run import NO_STEP, QUICK, refused
 
-from mipmap_plugin.cli import COMMANDS
-from mipmap_plugin.commands.types import read_scale
+from mipmap_plugin.cli import COMMANDS, EXAMPLES
+from mipmap_plugin.commands.types import read_scale, read_viewer
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
@@ -150,6 +150,24 @@ def test_the_folder_of_several_files_is_not_called_as_one_of_them(run, words):
 def test_an_empty_word_is_not_this_folder(run, words):
     """As of a variable that is not set, in quotes: `Path("")` is the current folder."""
     refused(run(*words), "a word of this command is empty")
+
+
+@pytest.mark.parametrize("words", ["adapt --scale 25%", "adapt --viewers spark", "adapt --up up", "levels a b"])
+def test_a_mistake_points_to_the_help_of_its_command(run, words):
+    command = words.split()[0]
+    said = run(*words.split())[2]
+    assert f"mipmap-plugin {command} --help" in said
+    assert [other for other in COMMANDS if other != command and f"mipmap-plugin {other}" in said] == []
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_help_of_a_command_has_an_example(run, name):
+    assert f"Example: mipmap-plugin {name} {EXAMPLES[name]}\n" in run(name, "--help")[1]
+
+
+@pytest.mark.parametrize(("text", "name"), [("SuperSplat", "supersplat"), ("Luma", "luma"), ("spark", "spark"), ("Sparky", "Sparky")])
+def test_viewers_are_named_as_their_makers_write_them_too(text, name):
+    assert read_viewer(text) == name
 
 
 @pytest.mark.parametrize(("text", "scale"), [("1/4", 0.25), ("4", 4.0), ("1e-3", 0.001), ("1 / 4", 0.25), ("×1/4", 0.25), ("0.25x", 0.25)])

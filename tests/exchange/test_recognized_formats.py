@@ -170,8 +170,8 @@ def test_a_streamed_sog_is_recognized_too(tmp_path):
 
 
 def test_other_json_is_no_sog(tmp_path):
-    (tmp_path / "transforms.json").write_text('{"frames": []}')
-    assert "no checkpoint that is known here" in sentence(tmp_path / "transforms.json")
+    (tmp_path / "scene.json").write_text('{"frames": []}')
+    assert "no checkpoint that is known here" in sentence(tmp_path / "scene.json")
 
 
 def as_splat(columns):

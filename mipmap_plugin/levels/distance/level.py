@@ -59,7 +59,7 @@ class WalkTask(Task):
 
     size: float = 1.0  # world units
 
-    def pixel(self, means: Tensor) -> float:
+    def pixel(self, model: SplatModel) -> float:
         return self.size
 
 
