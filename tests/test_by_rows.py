@@ -57,6 +57,22 @@ def dense_step(model, optimizer, shots=SHOTS):
     optimizer.zero_grad()
 
 
+def of(model, previous=None) -> ByRows | None:
+    return ByRows.of(model, SteppingRenderer(BACKEND.stepper, [Effects(1)]), previous)
+
+
+def optimizer_of(model, **settings):
+    return make_optimizer(model, recipe("default", 1 / 4, **settings), pixel=0.1)
+
+
+def stepped(model, *limits) -> ByRows:
+    """The rows of a model after a step."""
+    rows = of(model)
+    differentiate(rows)
+    rows.step(optimizer_of(model), *limits)
+    return rows
+
+
 def step_by_rows(model, optimizer, shots=SHOTS):
     rows = of(model, known.get(model))
     known[model] = rows
@@ -67,9 +83,7 @@ def step_by_rows(model, optimizer, shots=SHOTS):
 
 def test_a_step_leaves_colors_within_limits_and_is_followed_by_one_of_the_same_stepper():
     model = student()
-    rows = of(model)
-    differentiate(rows)
-    rows.step(make_optimizer(model, recipe("default", 1 / 4), pixel=0.1), (-0.1, 0.1))
+    rows = stepped(model, (-0.1, 0.1))
     colors = model.parameters()["sh0"].detach()
     assert colors.abs().max() == pytest.approx(0.1) and of(model, rows) is rows
     torch.testing.assert_close(draw(rows)[0], BACKEND.render(model.gaussians().detach(), *SHOTS[0]).image)
@@ -78,7 +92,7 @@ def test_a_step_leaves_colors_within_limits_and_is_followed_by_one_of_the_same_s
 def after(steps, **options) -> dict[str, torch.Tensor]:
     """The parameters and moments after some steps."""
     model = student(**options)
-    optimizer = make_optimizer(model, recipe("default", 1 / 4), pixel=0.1)
+    optimizer = optimizer_of(model)
     for step in steps:
         step(model, optimizer)
     parameters = model.parameters()
@@ -125,7 +139,7 @@ def test_views_of_a_step_may_be_differentiated_in_any_order_and_thread():
             rows.stepper.differentiate(number, images[number])
 
         list(side_by_side(one, order, 3))
-        rows.step(make_optimizer(model, recipe("default", 1 / 4), pixel=0.1))
+        rows.step(optimizer_of(model))
     assert all(torch.equal(one, other) for one, other in zip(*(model.parameters().values() for model in models), strict=True))
 
 
@@ -154,7 +168,7 @@ def test_a_view_that_was_projected_before_a_step_is_projected_again():
     rows = of(model)
     rows.stepper.prepare(SHOTS)
     rows.stepper.differentiate(0, torch.ones_like(rows.stepper.render(0, *SHOTS[0]).image))
-    rows.step(make_optimizer(model, recipe("default", 1 / 4), pixel=0.1))
+    rows.step(optimizer_of(model))
     assert all(map(torch.equal, draw(rows), draw(of(model))))
 
 
@@ -162,7 +176,7 @@ def test_a_view_that_was_projected_before_a_step_is_projected_again():
 def test_the_kernel_of_a_step_against_float64(nesterov):
     """One splat parameter, several steps: the formulas of Kingma and Ba, and Nesterov's momentum."""
     model = student(16)
-    optimizer = make_optimizer(model, recipe("default", 1 / 4, nesterov=nesterov), pixel=0.1)
+    optimizer = optimizer_of(model, nesterov=nesterov)
     opacity, mean, square = model.parameters()["opacities"].detach().double(), torch.zeros(16).double(), torch.zeros(16).double()
     (beta1, beta2), rate = optimizer.betas, recipe("default", 1 / 4).rates.opacities
     for count in (1, 2, 3):
@@ -183,21 +197,15 @@ def test_quaternions_of_any_length_stay_finite(size):
     model = student()
     with torch.no_grad():
         model.parameters()["quats"][::2] *= size
-    optimizer = make_optimizer(model, recipe("default", 1 / 4), pixel=0.1)
+    optimizer = optimizer_of(model)
     for _ in range(3):
         step_by_rows(model, optimizer)
     assert all(raw.isfinite().all() for raw in model.parameters().values())
 
 
-def of(model, previous=None) -> ByRows | None:
-    return ByRows.of(model, SteppingRenderer(BACKEND.stepper, [Effects(1)]), previous)
-
-
 def test_what_is_drawn_after_a_step_are_the_moved_parameters():
     model = student()
-    rows = of(model)
-    differentiate(rows)
-    rows.step(make_optimizer(model, recipe("default", 1 / 4), pixel=0.1))
+    rows = stepped(model)
     assert of(model, rows) is rows
     with torch.no_grad():
         for image, expected in zip(draw(rows), BACKEND.render_views(model.gaussians(), SHOTS), strict=True):
@@ -206,9 +214,7 @@ def test_what_is_drawn_after_a_step_are_the_moved_parameters():
 
 def test_changed_parameters_are_activated_anew_to_the_same_bytes():
     model = student()
-    rows = of(model)
-    differentiate(rows)
-    rows.step(make_optimizer(model, recipe("default", 1 / 4), pixel=0.1))
+    rows = stepped(model)
     with torch.no_grad():
         model.parameters()["scales"].add_(0)
         again = of(model, rows)

@@ -47,23 +47,17 @@ def ply(path, *columns):
 
 
 class TestOfTheExample(ModelSuite):
-    family = "npz"
+    family, write, record = "npz", staticmethod(archive), EXAMPLE["FAMILY"]
     cameras = tuple(tiny.cameras())
 
     @pytest.fixture
     def checkpoint(self, tmp_path):
-        register_model("npz", EXAMPLE["FAMILY"])
-        return archive(tmp_path / "scene.npz")
+        register_model(self.family, self.record)
+        return self.write(tmp_path / "scene.npz")
 
 
-class TestOfAFamilyWithFilesOfItsOwn(ModelSuite):
-    family = "cholesky"
-    cameras = tuple(tiny.cameras())
-
-    @pytest.fixture
-    def checkpoint(self, tmp_path):
-        register_model("cholesky", FILES["FAMILY"])
-        return factors(tmp_path / "scene.npz")
+class TestOfAFamilyWithFilesOfItsOwn(TestOfTheExample):
+    family, write, record = "cholesky", staticmethod(factors), FILES["FAMILY"]
 
 
 @pytest.mark.parametrize(("family", "write", "name"), [(FILES, factors, "scene_x0.25.npz"), (EXAMPLE, archive, "scene_x0.25.ply")])
