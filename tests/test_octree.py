@@ -9,7 +9,10 @@ import torch
 from anchor_checkpoints import STANDARD, VOXEL, Layout
 from anchor_models import VIEWS, agrees, assert_adapts, assert_decoded, assert_saved, gain, load, refused
 
+from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.evaluation.measure import baselines, supersampled
+from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.torchscript import read_torchscript
 from mipmap_plugin.models import load_model
@@ -49,6 +52,20 @@ def test_real_networks_decode(tmp_path, shared_data):
         (ply.parent / f"{name}.pt").write_bytes((shared_data / "checkpoints/octree_mlps" / f"{name}.pt").read_bytes())
     states = {name: {key: held.numpy() for key, held in read_torchscript(ply.parent / f"{name}.pt").items()} for name in ALL}
     agrees(load_model(tmp_path / "model").gaussians(VIEWS[0]), oracle.decode(checkpoints.columns(layout), states, layout, VIEWS[0]))
+
+
+@pytest.mark.parametrize("draw", [lambda model, view: model.render(view, 1 / 4, "scaled", 4).image, lambda *given: measured(*given)])
+def test_supersampled_it_shows_the_levels_of_its_samples(tmp_path, draw):
+    """As its own project does that renders so many pixels; the levels of the small picture alone are coarser."""
+    wrapped = wrap_model(load(tmp_path, LAYOUTS["plain"], count=80), cameras=VIEWS)
+    truth = resize(wrapped.render(VIEWS[0]).image.clamp(0, 1), VIEWS[0].zoomed(1 / 4).size, "box")
+    assert psnr(draw(wrapped, VIEWS[0].zoomed(1 / 4)).clamp(0, 1), truth) > 40
+
+
+def measured(model, view):
+    """The supersampled base of `evaluate` and `tradeoff`."""
+    [found] = [each for each in baselines(model, 1 / 4, "box", filters=(), samples=(4,)) if each.name == supersampled(4)]
+    return found.render(VIEWS[0])
 
 
 # Which networks take what

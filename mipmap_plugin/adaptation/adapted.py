@@ -188,7 +188,7 @@ def render_model(
     matrix = model.traits.exposures.of(camera) if effects.exposure else None
     family = f"family {model.family!r}"
     with naming_any({family: model}), unchanged(family, tensors_of(model)):
-        gaussians = checked_splats(model, camera)
+        gaussians = checked_splats(model, supersample.of_samples(camera, effects.supersampling))
     gaussians = gaussians if form is None else form(gaussians)
     rendered = supersample.render(backend, gaussians, camera, effects, clamped=clamped)
     if effects.outputs:

@@ -25,3 +25,9 @@ def render(backend: Backend, gaussians: Gaussians, camera: Camera, effects: Effe
     image = rendered.image.clamp(0, 1) if clamped else rendered.image
     blocks = image.unflatten(1, (-1, n)).unflatten(0, (-1, n))
     return Rendered(blocks.mean(dim=(1, 3)), rendered.alpha.unflatten(1, (-1, n)).unflatten(0, (-1, n)).mean(dim=(1, 3)))
+
+
+def of_samples(camera: Camera, n: int) -> Camera:
+    """The camera with the `zoom` of its n x n samples, but no finer than the training's: a model with levels of detail shows those of the samples."""
+    zoom = min(camera.zoom * n, max(1.0, camera.zoom))
+    return camera if zoom == camera.zoom else replace(camera, zoom=zoom)

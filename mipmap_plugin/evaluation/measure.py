@@ -18,6 +18,7 @@ from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import find_upsampler
 from mipmap_plugin.adaptation.views import extent
 from mipmap_plugin.adaptation.warn import silent
+from mipmap_plugin.backends import supersample
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.models.base import count_of, places
 from mipmap_plugin.wrap import Wrapped
@@ -117,7 +118,7 @@ def _render(model: Wrapped, camera: Camera, scale: float, screen_filter: str | N
     """The base's view of `camera`, the mean of n x n samples per pixel; filters that depend on the scale keep their size in output pixels."""
     if n == 1:
         return model.render(camera, scale, screen_filter).image
-    fine = camera.resized(camera.width * n, camera.height * n)
+    fine = supersample.of_samples(camera, n).resized(camera.width * n, camera.height * n)
     return resize(model.render(fine, scale * n, screen_filter).image.clamp(0, 1), camera.size, "box")
 
 
