@@ -29,6 +29,7 @@ from mipmap_plugin.commands.repeated import refuse_repeated
 from mipmap_plugin.commands.tradeoff import tradeoff
 from mipmap_plugin.commands.view import view
 from mipmap_plugin.errors import MipmapPluginError, SettingsError, of_a_file
+from mipmap_plugin.formats.here import told_from_here
 from mipmap_plugin.limits import is_out_of_memory
 from mipmap_plugin.process.freed_memory import keep_freed_memory
 from mipmap_plugin.process.garbage import leave_at_exit
@@ -160,7 +161,7 @@ def _show(text: str, said: set[str]) -> None:
 
 
 def _told(words: object) -> str:
-    """A message that names archives in place of the temporary folders they were unpacked to, which are gone when it is read."""
+    """A message with paths from the current folder, and archives in place of the temporary folders they were unpacked to, which are gone by then."""
     from mipmap_plugin.models.zipped_folder import told
 
-    return told(words)
+    return told_from_here(told(words))

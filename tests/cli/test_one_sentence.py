@@ -141,6 +141,20 @@ def test_words_that_are_not_understood_exit_with_2(run, words):
     assert code == 2 and "Traceback" not in err
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("adapt base.ply --scale 1/2 --output gone.ply", "mipmap-plugin: gone.ply is a link to something that is not there"),
+        ("adapt base.ply --scale 1/2 --tiles 99", "mipmap-plugin: base.ply has 60 splats, which cannot be cut into 99 tiles"),
+    ],
+)
+def test_what_is_refused_is_told_by_its_path_from_here(run, tmp_path, monkeypatch, words, told):
+    monkeypatch.chdir(tmp_path)
+    tiny.ply(tmp_path / "base.ply")
+    (tmp_path / "gone.ply").symlink_to(tmp_path / "nowhere")
+    assert told in refused(run(*words.split()))
+
+
 @pytest.mark.parametrize("words", ["levels base.ply --viewer spark --output new.ply", "tradeoff base.ply --scale 1/2 --output new.json --no-picture"])
 def test_the_folder_of_several_files_is_not_called_as_one_of_them(run, words):
     refused(run(*words.split()), "several files are written there; give the path of a folder")
