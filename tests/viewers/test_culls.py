@@ -28,22 +28,20 @@ def test_webgpu_tests_the_size_along_x_and_y(backend):
     assert alpha(backend, "playcanvas-webgpu", slanted).max() == 0
 
 
-@BOTH
-def test_webgpu_drops_a_splat_that_contributes_less_than_three(backend):
-    # opacity · 2π · sqrt(det) in half pixels, with variances 4·(0.1 + 0.075) and 4·(0.2 + 0.075)
-    least = 3 / (2 * math.pi * math.sqrt(0.7 * 1.1))
-    assert alpha(backend, "playcanvas-webgpu", splat(0.1, 0.2, least * 0.999)).max() == 0
-    assert alpha(backend, "playcanvas-webgpu", splat(0.1, 0.2, least * 1.001)).max() > 0
-    assert alpha(backend, "playcanvas", splat(0.1, 0.2, least * 0.999)).max() > 0
+LEAST = [
+    # 3 of opacity · 2π · sqrt(det) in half pixels, with variances 4·(0.1 + 0.075) and 4·(0.2 + 0.075)
+    ("playcanvas-webgpu", "playcanvas", (0.1, 0.2), 3 / (2 * math.pi * math.sqrt(0.7 * 1.1))),
+    # A quarter of opacity times determinant; dilated, that is of 0.5 + 0.3 and 0.1 + 0.3 px², 0.32 px⁴
+    ("viser", "classic", (0.5, 0.1), 0.25 / 0.32),
+]
 
 
 @BOTH
-def test_viser_drops_a_splat_whose_opacity_times_determinant_is_less_than_a_quarter(backend):
-    # Dilated: 0.5 + 0.3 and 0.1 + 0.3 px², a determinant of 0.32 px⁴
-    least = 0.25 / 0.32
-    assert alpha(backend, "viser", splat(0.5, 0.1, least * 0.999)).max() == 0
-    assert alpha(backend, "viser", splat(0.5, 0.1, least * 1.001)).max() > 0
-    assert alpha(backend, "classic", splat(0.5, 0.1, least * 0.999)).max() > 0
+@pytest.mark.parametrize(("viewer", "other", "shape", "least"), LEAST)
+def test_a_viewer_drops_a_splat_that_contributes_too_little(backend, viewer, other, shape, least):
+    assert alpha(backend, viewer, splat(*shape, least * 0.999)).max() == 0
+    assert alpha(backend, viewer, splat(*shape, least * 1.001)).max() > 0
+    assert alpha(backend, other, splat(*shape, least * 0.999)).max() > 0
 
 
 @BOTH
