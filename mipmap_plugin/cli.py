@@ -36,7 +36,8 @@ from mipmap_plugin.process.garbage import leave_at_exit
 from mipmap_plugin.process.signals import ends_as_by_ctrl_c
 
 DESCRIPTION = (
-    "Make a Gaussian-splatting checkpoint look right at another zoom. With every command go --quiet, to print errors, warnings and JSON only, "
+    "Make a Gaussian-splatting checkpoint look right at another zoom. mipmap-plugin COMMAND --help lists a command's options and shows an example. "
+    "With every command go --quiet, to print errors, warnings and JSON only, "
     "and --log FILE, to append all that is said, with further details, to a file. mipmap-plugin --version tells the version."
 )
 
