@@ -33,11 +33,11 @@ class CholeskyModel(VanillaModel):
             return super().refuse_output(path, overwrite=overwrite)
         refuse_output(path, overwrite, [self.source] if self.source else [], is_file=True)
 
-    def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:
+    def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False, **options: Any) -> Path:
         path, g = Path(path), self.gaussians().detach()
         self.refuse_output(path, overwrite=overwrite)
         if path.suffix != ".npz":  # a PLY, which viewers read
-            return super().save(path, provenance=provenance, overwrite=overwrite)
+            return super().save(path, provenance=provenance, overwrite=overwrite, **options)
         sides = rotations(g.quats.double()) * g.scales.double()[:, None, :].clamp_min(1e-9)
         arrays = dict(means=g.means, cholesky=torch.linalg.cholesky(sides @ sides.mT), opacities=g.opacities, rgb=g.sh[:, 0] * C0 + 0.5)
         with new_file(path, overwrite) as temporary, temporary.open("wb") as file:  # it appears whole or not at all

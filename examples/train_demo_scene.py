@@ -15,7 +15,8 @@ import tyro
 from torch import Tensor
 from tqdm import tqdm
 
-from mipmap_plugin.adaptation.optimization.loop import Run, Task, adapt
+from mipmap_plugin.adaptation.optimization.loop import adapt
+from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.validation import no_validation
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs

@@ -172,12 +172,13 @@ class FrozenBase:
         default renderers that draw as the training did.
         `cameras`: views of the base scale, instead of the checkpoint's own. `settings` override those of the recipe, by the names
         of AdaptConfig: steps, time_budget_s, target_db, seed, views, ... `resume`: a file to continue from if it exists; Ctrl-C writes it
-        and raises Interrupted, a long run writes it every minute, and saving the model removes it. `observe(step, seconds, render)` is
-        called before the first step and after each (of the conversion before a zoom-in, too: `adaptation.conversion`); `render(camera)` is
-        the current image [H, W, 3], without gradients, and the run ends where it returns True.
+        and raises Interrupted, unless the program has a handler of its own, which is called; a long run writes it every minute, and saving the
+        model removes it. `observe(step, seconds, render)` is called before the first step and after each (of the conversion before a zoom-in,
+        too: `adaptation.conversion`); `render(camera)` is the current image [H, W, 3], without gradients, and the run ends where it returns True.
         `images`: a scene, or its path, whose training images are the truth of a zoom-in, instead of the base's renders of these views.
-        `start`: a model adapted for the same viewer to a finer scale, to start from instead of from the base. While it runs, torch's default dtype is
-        float32, and torch may have one thread, in the whole process: torch has one of each. Raises SettingsError and BackendUnavailable.
+        `start`: a model adapted from this base for the same viewer to a finer scale, to start from instead of from the base. While it runs, torch's
+        default dtype is float32, and torch may have one thread, in the whole process: torch has one of each.
+        Raises SettingsError, SceneError, BackendUnavailable, PluginError.
         """
         scale, cameras = check_scale(scale), None if cameras is None else of_base_scale(cameras, some=True)
         check_kinds(observe=(observe, Callable))

@@ -67,7 +67,7 @@ class Adapted:
 
     @in_usual_modes
     def render(self, camera: Camera, *, outputs: Sequence[str] | None = (), exposure: bool = False, viewer: str | None = None) -> Rendered:
-        """Render the view of a camera of the new scale, in one of the `viewers`; `outputs` and `exposure` as in `Wrapped.render`."""
+        """Render the view of a camera of the new scale, in one of the `viewers`; `outputs`, `exposure` and errors as in `Wrapped.render`."""
         [camera] = checked([camera])
         outputs = as_outputs(outputs)
         if viewer is not None and viewer not in tuple(self.viewers):
@@ -95,7 +95,10 @@ class Adapted:
         return notebook.table("Adapted", facts, lambda camera: self.render(camera).image, self.views()[0])
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
-        """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""
+        """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path.
+
+        Raises OutputExists, OutputError, and SettingsError for a format that the family does not write.
+        """
         path = path_of(path)
         refuse_output(path, overwrite, parts_of(self.model.source, self.model.folder))  # whatever the family itself looks at
         family = {f"family {self.model.family!r}": self.model}

@@ -42,7 +42,7 @@ def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     the frame of HyperNeRF's captures, which Deformable 3D Gaussians moves and scales, and which frames of DyNeRF's it takes; without it (a lone
     file, exported from a model folder) a cameras.json is read with the cfg_args beside it. A folder with both COLMAP's `sparse` and
     transforms files is read from `sparse`, as graphdeco-inria does.
-    Raises SceneError.
+    Raises SceneError, and SettingsError for what is no path.
     """
     path = path_of(path)
     if not path.exists():

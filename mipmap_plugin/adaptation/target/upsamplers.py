@@ -32,7 +32,7 @@ _PLACES: dict[str, Path] = {}
 
 
 def register_upsampler(name: str, target: Any, *, replace: bool = False) -> None:
-    """Register a function `(image [H, W, 3], size) -> [size[0], size[1], 3]`, or `"package.module:function"`, under `name`."""
+    """Register a function `(image [H, W, 3], size) -> [size[0], size[1], 3]`, or `"package.module:function"`, under `name`. Raises SettingsError."""
     UPSAMPLERS.add(name, target, replace=replace)
 
 
