@@ -11,6 +11,8 @@ from PIL import Image
 
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.errors import SceneError, SettingsError
+from mipmap_plugin.evaluation.protocols import PROTOCOLS
+from mipmap_plugin.evaluation.protocols import test_views as judged_views
 from mipmap_plugin.scenes import load_photographs, load_scene
 
 pycolmap = pytest.importorskip("pycolmap", reason="COLMAP scenes are read by pycolmap, an extra")
@@ -106,8 +108,19 @@ def test_a_wide_lens_makes_photographs_larger_when_they_are_undistorted(tmp_path
     assert (view.width, view.height) == (77, 51)
     (tmp_path / "images").rename(tmp_path / "images_2")
     write_photographs(tmp_path / "images_2", names(2), size=(32, 24))
-    with pytest.raises(SettingsError, match="has 38 x 26 px, but the base was trained at 77 x 51 px"):
+    with pytest.raises(SettingsError, match="has 37 x 24 px, but the base was trained at 74 x 48 px"):
         Photographs(load_scene(tmp_path), scene.cameras, (0, 0, 0))
+
+
+def test_an_undistorted_copy_is_judged_in_its_own_field_of_view(tmp_path):
+    """Its sides are rounded by itself: what is 77 px wide at full size is 37 px wide at half."""
+    write_text_model(tmp_path / "sparse/0", ["a.png"], "SIMPLE_RADIAL", "40 32 24 -0.2")
+    write_photographs(tmp_path / "images_2", ["a.png"], size=(32, 24))
+    scene = load_scene(tmp_path)
+    [camera], [view] = scene.cameras, judged_views(scene, scene.cameras, (0.0, 0.0, 0.0))
+    height, width, _ = scene.image(camera, (0, 0, 0)).shape
+    assert (view.camera.size, view.camera.fx) == ((2 * height, 2 * width), 40) and camera.size != view.camera.size
+    assert view.truth(1 / 2, PROTOCOLS["P3"]).shape == (height, width, 3)
 
 
 def test_photographs_that_were_turned_are_refused(tmp_path):

@@ -165,7 +165,8 @@ def test_views(scene: Scene, base: Sequence[Camera], background: tuple[float, fl
     cameras = _judged(scene, base)
     if not cameras:
         raise SettingsError(f"{scene.source}: there are no photographs to compare with")
-    views = zip(at_density_of(cameras, base), kept_photographs(scene, cameras, background), (scene.images[c] for c in cameras), strict=True)
+    dense = at_density_of([*map(scene.as_photographed, cameras)], base)
+    views = zip(dense, kept_photographs(scene, cameras, background), (scene.images[c] for c in cameras), strict=True)
     return [TestView(camera, photograph, file, background, file in scene.lenses, has_alpha(file)) for camera, photograph, file in views]
 
 

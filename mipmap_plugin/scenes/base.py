@@ -15,7 +15,7 @@ from torch import Tensor
 from mipmap_plugin.camera import DIGITS, Camera, digest_of
 from mipmap_plugin.errors import SceneError, SettingsError
 from mipmap_plugin.formats.images import image_size, is_file, read_image, shown_turned
-from mipmap_plugin.scenes.lenses import Lens
+from mipmap_plugin.scenes.lenses import Lens, can_undistort
 
 # The word of notes on photographs that are not there.
 ABSENT = "absent"
@@ -125,7 +125,15 @@ class Scene:
 
     def image_size(self, camera: Camera) -> tuple[int, int]:
         """(width, height) px of the photograph of `camera`, undistorted."""
-        return self._undistorted_size(image_size(self.images[camera]), camera)
+        seen = self.as_photographed(camera)
+        return self._undistorted_size(image_size(self.images[camera]), camera) if seen is camera else (seen.width, seen.height)
+
+    def as_photographed(self, camera: Camera) -> Camera:
+        """`camera` with the field of view of its photograph: the undistorted size of a smaller copy is rounded by itself, and its field with it."""
+        lens, size = self.lenses.get(self.images[camera]), image_size(self.images[camera])
+        if lens is None or size == (lens.width, lens.height) or not can_undistort():
+            return camera
+        return lens.at(size).straightened(camera)
 
     def _undistorted_size(self, size: tuple[int, int], camera: Camera) -> tuple[int, int]:
         """`size` of the photograph of `camera`, or of a copy of it, scaled by the ratio of the undistorted image to the whole one."""

@@ -40,7 +40,7 @@ class Photographs:
             raise SettingsError(f"the checkpoint has no cameras, so that the scale of the images is not known; {remedy}")
         self._scene, self._background = scene, background
         originals = [camera for camera in scene.split("train") if camera in scene.images]
-        self._originals = dict(zip(at_density_of(originals, base), originals, strict=True))
+        self._originals = dict(zip(at_density_of([*map(scene.as_photographed, originals)], base), originals, strict=True))
         if not self._originals:
             raise SettingsError(f"{scene.source}: there are no training images to adapt to; leave them out, or give the folder that has them")
         self.cameras = list(self._originals)
