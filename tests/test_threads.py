@@ -257,12 +257,12 @@ def test_what_takes_seconds_of_a_large_scene_is_announced(tmp_path, monkeypatch)
 
 def test_the_clock_of_a_bar_goes_on_while_nothing_is_counted(monkeypatch):
     monkeypatch.setattr(progress, "PATIENCE", 0.01)
-    errors = Terminal()
-    with progress.Bar(total=2, file=errors) as bar, progress.ticking(bar):
+    monkeypatch.setattr(sys, "stderr", errors := Terminal())
+    with progress.Bar(total=2) as bar, progress.ticking(bar):
         shown = errors.getvalue()
         wait_until(lambda: errors.getvalue() != shown)
-    silent = io.StringIO()
-    with progress.Bar(total=2, file=silent) as bar, progress.ticking(bar):
+    monkeypatch.setattr(sys, "stderr", silent := io.StringIO())
+    with progress.Bar(total=2) as bar, progress.ticking(bar):
         time.sleep(0.05)
     assert not silent.getvalue()
 
