@@ -166,7 +166,7 @@ def test_a_format_that_nothing_here_writes_is_refused_before_any_work(tmp_path, 
     assert "run: npm install" in refused("adapt", base, "--scale", "1/2", "--output", tmp_path / "new.spz", *INSTANT)
 
 
-@pytest.mark.parametrize("output", [".", ""])
+@pytest.mark.parametrize("output", [".", "./"])
 def test_the_working_folder_is_a_folder_like_others(tmp_path, refused, monkeypatch, output):
     base = tiny.ply(tmp_path / "base.ply")
     (tmp_path / "here").mkdir()

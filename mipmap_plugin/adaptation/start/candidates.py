@@ -226,11 +226,10 @@ class StartSearch:
 
     def _coarse_bounds(self, bounds: Bounds, finer: Quality) -> Bounds | None:
         """The bounds of a coarsely merged candidate; None where there are none of these. `finer`: the quality of the finer level."""
-        problem = self._problem
-        if problem.coarse_base is None:
+        if (coarse_base := self._problem.coarse_base) is None:
             return None
-        base = problem.quality(problem.coarse_base())
-        return bounds._replace(psnr=max(bounds.psnr, LEAST_DB, finer.psnr - problem.may_lose, base.psnr - COARSE_COSTS))
+        base = self._problem.quality(coarse_base())
+        return bounds._replace(psnr=max(bounds.psnr, LEAST_DB, finer.psnr - self._problem.may_lose, base.psnr - COARSE_COSTS))
 
     def _candidate(self, weights: Tensor | None, fraction: float, coarsely: bool = False) -> SplatModel:
         """The base in closed form, after merging its splats down to a fraction of them, or to the settings' `most_splats`."""
@@ -275,10 +274,9 @@ class StartSearch:
     def _closed_form(self, gaussians: Gaussians, weights: Tensor | None) -> tuple[Tensor, Tensor]:
         """Scales [N, 3] and opacities [N] in closed form, with opacities that match the blend weights where these are known."""
         problem, rounds = self._problem, self._matching_rounds(weights)
-        area_power = 1.0 if rounds else AREA_POWER
         pixel = self._seen.pixel_size(gaussians.means)
         formed_for = mean_pixel_size(gaussians.means, problem.closest_of, self._seen.count) if problem.scale > 1 else pixel
-        settings = FormSettings(area_power, self._crispness, self._seen.count, formed_for, matched=rounds > 0)
+        settings = FormSettings(1.0 if rounds else AREA_POWER, self._crispness, self._seen.count, formed_for, matched=rounds > 0)
         scales, opacities = closed_form(gaussians, problem.views, problem.scale, problem.base_effects, problem.target, settings)
         if weights is None or not rounds:
             return scales, opacities
