@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -13,7 +14,11 @@ def from_here(path: Path) -> str:
 
 def told_from_here(text: str) -> str:
     """A text whose paths, as jobs have them, are told as `from_here` tells them."""
-    return re.sub(rf"(?<![^\s'\"(]){re.escape(str(Path.cwd()))}/", "", text)
+    try:
+        here = re.escape(f"{Path.cwd()}{os.sep}")
+    except FileNotFoundError:  # the current directory was deleted: no path lies in it
+        return text
+    return re.sub(rf"(?<![^\s'\"(]){here}", "", text)
 
 
 def size_in_bytes(count: int) -> str:

@@ -2,6 +2,7 @@
 
 import errno
 import inspect
+import os
 import re
 import subprocess
 import sys
@@ -153,6 +154,15 @@ def test_what_is_refused_is_told_by_its_path_from_here(run, tmp_path, monkeypatc
     tiny.ply(tmp_path / "base.ply")
     (tmp_path / "gone.ply").symlink_to(tmp_path / "nowhere")
     assert told in refused(run(*words.split()))
+
+
+def test_what_is_refused_is_told_where_the_current_folder_was_deleted(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # which pytest leaves before it goes on
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    os.chdir(gone)
+    gone.rmdir()
+    refused(run("inspect", str(tmp_path / "none.ply")), f"{tmp_path / 'none.ply'} does not exist")
 
 
 @pytest.mark.parametrize("words", ["levels base.ply --viewer spark --output new.ply", "tradeoff base.ply --scale 1/2 --output new.json --no-picture"])
