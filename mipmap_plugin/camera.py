@@ -294,6 +294,6 @@ def digest_of(cameras: Sequence[Camera]) -> str:
     """A hash of everything that images depend on, hexadecimal; names are left out."""
     digest = hashlib.sha256()
     for view in cameras:
-        facts = (view.width, view.height, view.fx, view.fy, view.cx, view.cy, view.split, view.time, view.zoom, view.index)
+        facts = (view.width, view.height, view.fx, view.fy, view.cx, view.cy, view.split, view.time, view.zoom, view.base_zoom, view.index)
         digest.update(repr(facts).encode() + view.viewmat.numpy().tobytes())
     return digest.hexdigest()[:DIGITS]

@@ -1,7 +1,7 @@
 """Camera: zooms keep the field of view, and a known point lands on a known pixel."""
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from mipmap_plugin.camera import Camera, of_base_scale
+from mipmap_plugin.camera import Camera, digest_of, of_base_scale
 from mipmap_plugin.errors import SettingsError, ShapeError
 
 # Evaluated by hand in float64: quaternion (0.9, 0.1, -0.2, 0.3) normalized, translation (0.5, -0.25, 4).
@@ -199,3 +199,11 @@ def test_a_pose_of_few_digits_is_taken_as_it_is(camera):
 def test_a_scale_of_the_whole_pose_is_divided_out(camera, scale):
     scaled = VIEWMAT * torch.tensor([scale, scale, scale, 1.0], dtype=torch.float64)[:, None]
     torch.testing.assert_close(replace(camera, viewmat=scaled).viewmat, VIEWMAT, rtol=0, atol=1e-8)
+
+
+def test_a_digest_follows_all_that_images_depend_on(camera):
+    changes = {"width": 9, "height": 9, "fx": 9.0, "fy": 9.0, "cx": 9.0, "cy": 9.0, "viewmat": torch.eye(4), "split": "train", "time": 0.25}
+    changes |= {"zoom": 9.0, "base_zoom": 9.0, "index": 9}
+    same = {name for name, value in changes.items() if digest_of([replace(camera, **{name: value})]) == digest_of([camera])}
+    assert {field.name for field in fields(camera)} == {"name", *changes}
+    assert same == set()

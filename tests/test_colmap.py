@@ -342,7 +342,10 @@ def test_photographs_of_a_folder_of_another_name_are_those_of_the_training(tmp_p
     assert [(file.parent.name, camera.size) for camera, file in scene.images.items()] == [(taken, (48, 64))]
 
 
-@pytest.mark.parametrize(("size", "told"), [((64, 46), True), ((31, 24), False), ((32, 23), False), ((62, 48), True)])
+@pytest.mark.parametrize(
+    ("size", "told"),
+    [((64, 46), True), ((31, 24), False), ((32, 23), False), ((62, 48), True), ((514, 381), False), ((512, 360), True)],
+)
 def test_photographs_that_were_cropped_a_little_are_told_of_and_rounded_copies_are_not(tmp_path, size, told):
     write_text_model(tmp_path / "sparse/0", names(2))
     write_photographs(tmp_path / "images", names(2), size=size)

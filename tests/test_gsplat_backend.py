@@ -143,6 +143,19 @@ def test_a_cuda_part_that_does_not_load_is_said_in_a_sentence(loaded, said, monk
     assert said in str(caught.value)
 
 
+def test_a_gsplat_that_cannot_be_imported_is_said_in_a_sentence(monkeypatch):
+    """Looking for its CUDA part imports it."""
+
+    def find(name):
+        raise ImportError("numpy.core.multiarray failed to import")
+
+    monkeypatch.setattr(module.importlib.util, "find_spec", find)
+    module.unloadable.cache_clear()
+    said = module.unloadable()
+    module.unloadable.cache_clear()
+    assert said.startswith("gsplat's CUDA part does not compile or load here (numpy.core")
+
+
 def test_it_is_listed_with_its_reasons_and_refuses(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert "gsplat" in BACKENDS.names()

@@ -1,5 +1,7 @@
 """Octree-GS: its levels follow distance and zoom as in its own project; the rest it shares with Scaffold-GS."""
 
+from dataclasses import replace
+
 import anchor_checkpoints as checkpoints
 import anchor_oracle as oracle
 import numpy as np
@@ -10,6 +12,7 @@ from anchor_checkpoints import STANDARD, VOXEL, Layout
 from anchor_models import VIEWS, agrees, assert_adapts, assert_decoded, assert_saved, gain, load, refused
 
 from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.backends.supersample import of_samples
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.measure import baselines, supersampled
 from mipmap_plugin.evaluation.metrics import psnr
@@ -66,6 +69,12 @@ def measured(model, view):
     """The supersampled base of `evaluate` and `tradeoff`."""
     [found] = [each for each in baselines(model, 1 / 4, "box", filters=(), samples=(4,)) if each.name == supersampled(4)]
     return found.render(VIEWS[0])
+
+
+@pytest.mark.parametrize("lens", [0.5, 1.0, 4.0])
+def test_samples_through_any_lens_show_the_levels_that_the_base_shows_through_it(lens):
+    whole = replace(VIEWS[0], zoom=lens, base_zoom=lens)
+    assert of_samples(whole.zoomed(1 / 4), 16).zoom == of_samples(whole, 2).zoom == lens
 
 
 # Which networks take what

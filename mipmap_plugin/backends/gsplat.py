@@ -86,9 +86,9 @@ def missing() -> list[str]:
 @cache
 def unloadable() -> str:
     """Why gsplat's CUDA part, which compiles for minutes when it is first imported, does not load; empty if it does."""
-    if importlib.util.find_spec(CUDA_PART) is None:  # in a version that keeps it elsewhere
-        return ""
     try:
+        if importlib.util.find_spec(CUDA_PART) is None:  # in a version that keeps it elsewhere; this imports gsplat
+            return ""
         loaded = getattr(importlib.import_module(CUDA_PART), "_C", None) is not None
     except Exception as error:  # compilers and linkers fail in any way
         advice = "install its wheel for your torch and CUDA, or choose another backend"

@@ -28,6 +28,6 @@ def render(backend: Backend, gaussians: Gaussians, camera: Camera, effects: Effe
 
 
 def of_samples(camera: Camera, n: int) -> Camera:
-    """The camera with the `zoom` of its n x n samples, but no finer than the training's: a model with levels of detail shows those of the samples."""
-    zoom = min(camera.zoom * n, max(1.0, camera.zoom))
+    """The camera with the `zoom` of its n x n samples, by which levels of detail are chosen, but no finer than at the base's scale."""
+    zoom = min(camera.zoom * n, max(camera.base_zoom, camera.zoom))
     return camera if zoom == camera.zoom else replace(camera, zoom=zoom)

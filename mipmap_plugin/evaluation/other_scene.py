@@ -1,4 +1,4 @@
-"""Photographs that are of another scene than the checkpoint, or of another size: all figures would be of no use, or of another scale."""
+"""Photographs that are of another scene than the checkpoint, or of a smaller size: all figures would be of no use, or of another scale."""
 
 from __future__ import annotations
 
@@ -48,9 +48,10 @@ def of_another_scene(model: Wrapped, views: Sequence[TruthView], scale: float, p
 
 
 def of_another_size(model: Wrapped, scene: Scene) -> str:
-    """That a training on these photographs has pictures of another size than the base's cameras, in a sentence; "" if they are alike.
+    """That a training on these photographs has smaller pictures than the base's cameras, in a sentence; "" if it has not.
 
     A cameras.json states the size that COLMAP saw, which the photographs of Tanks and Temples in 3DGS's own download have not: they are half of it.
+    Larger ones are no such doubt: a zoom-in is judged against the photographs that smaller ones for the training were made from.
     """
     cfg = read_options(model.model.folder)[0]
     whole = (view for view, file in scene.images.items() if file.parent.name == photographs_folder(cfg) and file not in scene.lenses)
@@ -59,7 +60,7 @@ def of_another_size(model: Wrapped, scene: Scene) -> str:
         return ""
     own, names = scene.image_size(view), names_of(view)
     trained, there = trained_size(*own, {**cfg, "images": "", "ds": 1}), [base for base in model.cameras if names_of(base)[0] in names]
-    if not there or any(max(abs(base.width - trained[0]), abs(base.height - trained[1])) <= ROUNDING for base in there):
+    if not there or any(max(base.width - trained[0], base.height - trained[1]) <= ROUNDING for base in there):
         return ""
     said, found, expected = (f"{width} x {height} px" for width, height in ((there[0].width, there[0].height), own, trained))
     doubt = f"the base's cameras are of {said}, but a training on the photographs (of {found}) has pictures of {expected}"

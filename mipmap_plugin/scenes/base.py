@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import DIGITS, Camera, digest_of
-from mipmap_plugin.errors import SceneError, SettingsError
+from mipmap_plugin.errors import SceneError, SettingsError, plural
 from mipmap_plugin.formats.images import image_size, is_file, read_image, shown_turned
 from mipmap_plugin.scenes.lenses import Lens, can_undistort
 
@@ -173,7 +173,8 @@ def other_shape(stated: tuple[int, int], photograph: Path, where: str) -> str:
         if shown_turned(photograph) and not _too_far(stated, (height, width)):
             advice = "its EXIF says to show it turned, which is not done here; save a copy whose pixels are turned (magick -auto-orient)"
         raise SceneError(f"{where}: its camera is of {wide} x {high} px, but the photograph has {width} x {height} px: {advice}")
-    rounding = 1 + high / wide if width < wide and height < high else 1.0  # px of the height; both sides of a smaller copy are rounded
+    # px of the height: both sides of a smaller copy are rounded, be it the photograph or what the camera was found in.
+    rounding = (1 + high / wide) * max(1.0, width / wide) if (width - wide) * (height - high) > 0 else 1.0
     differs = abs(height - high * width / wide) > rounding
     return f"{photograph.name} has {width} x {height} px, its camera {wide} x {high} px" if differs else ""
 
@@ -184,7 +185,7 @@ def note_on_shapes(found: Sequence[str]) -> list[str]:
         return []
     others = [each for each in found if each]
     cropped = "if they were cropped, every figure is of a distorted scene: give the cameras of the cropped ones"
-    return [f"the cameras of {len(others)} photographs are {STRETCHED} to their shape, as in 3DGS ({others[0]}); {cropped}"]
+    return [f"the cameras of {plural(len(others), 'photograph')} are {STRETCHED} to their shape, as in 3DGS ({others[0]}); {cropped}"]
 
 
 def _too_far(stated: tuple[int, int], size: tuple[int, int]) -> bool:
