@@ -1,6 +1,7 @@
 """Networks as upsamplers: read without executing, cascaded to any size, in tiles where they are large, kept on disk."""
 
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import pytest
@@ -11,9 +12,10 @@ from mipmap_plugin.adaptation.target import super_resolution
 from mipmap_plugin.adaptation.target.disk_cache import cache_folder, cached, fingerprint
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.super_resolution import Network
-from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS, find_upsampler
+from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS, find_upsampler, network_input, placed
 from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.process.torchvision_absent import torchvision_optional
 
 
@@ -260,3 +262,18 @@ def test_a_torchvision_that_works_is_used(monkeypatch):
 def test_an_upsampler_that_breaks_its_contract_is_told(upsampler, said):
     with UPSAMPLERS.temporarily(odd=upsampler), pytest.raises(PluginError, match=said):
         find_upsampler("odd")(torch.zeros(24, 32, 3), (48, 64))
+
+
+def test_a_job_reads_the_network_that_came_with_it(tmp_path):
+    """Another job of the same worker may name its own alike, and end first."""
+    for content in ("mine", "other"):
+        (tmp_path / content).write_text(content)
+
+    def another_job():
+        with placed("net.pth", tmp_path / "other"):
+            return network_input("net.pth")
+
+    with placed("net.pth", tmp_path / "mine"), ThreadPoolExecutor(1) as pool:
+        assert pool.submit(another_job).result() == {"network": sha256(tmp_path / "other")}
+        assert network_input("net.pth") == {"network": sha256(tmp_path / "mine")}
+    assert network_input("net.pth") == {}

@@ -50,7 +50,8 @@ def of_another_scene(model: Wrapped, views: Sequence[TruthView], scale: float, p
 def of_another_size(model: Wrapped, scene: Scene) -> str:
     """That a training on these photographs has smaller pictures than the base's cameras, in a sentence; "" if it has not.
 
-    A cameras.json states the size that COLMAP saw, which the photographs of Tanks and Temples in 3DGS's own download have not: they are half of it.
+    A cameras.json states the size that COLMAP saw, which the photographs of Tanks and Temples in 3DGS's own download have not:
+    they are half of it (graphdeco-inria/gaussian-splatting, issue 692).
     Larger ones are no such doubt: a zoom-in is judged against the photographs that smaller ones for the training were made from.
     """
     cfg = read_options(model.model.folder)[0]

@@ -88,11 +88,10 @@ def best_start(problems: Sequence[StartProblem]) -> tuple[SplatModel, str, list[
 
     At x1 a viewer's filter may be wider than the base's, which takes from thin splats what a zoom-in, where that filter is narrower, needs.
     """
-    searches = [StartSearch(problem) for problem in problems]
-    found = [search.best() for search in searches]
-    start, name = max(found, key=lambda each: problems[0].quality(each[0]).visible) if len(found) > 1 else found[0]
+    found = [(*search.best(), search.notes) for search in map(StartSearch, problems)]  # none keeps its memory during the next
+    start, name, _ = max(found, key=lambda each: problems[0].quality(each[0]).visible) if len(found) > 1 else found[0]
     told = f"{name} without the conversion" if start is not found[0][0] else name
-    return start, told, [note for search in searches for note in search.notes]
+    return start, told, [note for *_, notes in found for note in notes]
 
 
 def mildest_costs(config: AdaptConfig, base: Effects, target: Effects) -> float:

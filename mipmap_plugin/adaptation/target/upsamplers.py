@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,8 +28,8 @@ UPSAMPLERS = Registry(
     {name: f"mipmap_plugin.adaptation.target.upsamplers:{name}" for name in ("bicubic", "lanczos")},
 )
 
-# Where networks' files lie in this process that settings name by the paths of another one.
-_PLACES: dict[str, Path] = {}
+# Where the file of a network lies here that settings name by its path on another machine, by that name.
+_PLACED: ContextVar[tuple[str, Path] | None] = ContextVar("placed", default=None)
 
 
 def register_upsampler(name: str, target: Any, *, replace: bool = False) -> None:
@@ -91,16 +92,16 @@ def network_input(name: str) -> dict[str, str]:
 @contextmanager
 def placed(name: str, file: Path | None) -> Iterator[None]:
     """Inside, read the network that settings name from `file`, unless that is None."""
-    if file is not None:
-        _PLACES[name] = file
+    token = _PLACED.set(None if file is None else (name, file))
     try:
         yield
     finally:
-        _PLACES.pop(name, None)
+        _PLACED.reset(token)
 
 
 def _file(name: str) -> Path:
-    return _PLACES.get(name, Path(name))
+    placed_here = _PLACED.get()
+    return placed_here[1] if placed_here and placed_here[0] == name else Path(name)
 
 
 def bicubic(image: Tensor, size: tuple[int, int]) -> Tensor:
