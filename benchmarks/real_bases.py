@@ -60,11 +60,7 @@ def main(
         backend: A backend's name.
     """
     torch.set_num_threads(1)
-    bases = only or tuple(base for base in SCALES if (data / "checkpoints" / "bases" / base).is_dir())
-    if not bases or not SCALES.keys() >= set(bases):
-        print(f"benchmarks/real_bases.py: {data} holds no such base; known are {', '.join(SCALES)}, in checkpoints/bases", file=sys.stderr)
-        raise SystemExit(2)
-    for base in bases:
+    for base in bases_of(data, only):
         recipes = recipe or (RECIPES if max(SCALES[base]) > 1 else (*RECIPES, "thorough"))
         wrapped = wrap_model(data / "checkpoints" / "bases" / base, backend=backend)
         scene = load_scene(data / "images" / base.split("_")[0])
@@ -73,6 +69,15 @@ def main(
         write_json(output / f"{base}.json", records(rows), overwrite=True)
         print(f"{base}\n{table(rows)}\n", flush=True)
     write_page(output / "real_bases.md", INTRO, output.glob("*_[0-9]*.json"))
+
+
+def bases_of(data: Path, only: Sequence[str]) -> Sequence[str]:
+    """The bases that are asked for, or all that lie in DATA; ends with exit code 2 if there is none, or one is unknown."""
+    bases = only or [base for base in SCALES if (data / "checkpoints" / "bases" / base).is_dir()]
+    if not bases or not SCALES.keys() >= set(bases):
+        print(f"{data} holds no such base; known are {', '.join(SCALES)}, in checkpoints/bases", file=sys.stderr)
+        raise SystemExit(2)
+    return bases
 
 
 def kept(file: Path, measured: Sequence[str]) -> list[Row]:

@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 import tyro
 from pages import write_page
-from real_bases import SCALES
+from real_bases import SCALES, bases_of
 
 from mipmap_plugin import load_scene, wrap_model
 from mipmap_plugin.evaluation.evaluate import Evaluator, Row, adapted_row
@@ -29,9 +29,8 @@ PARTS = {"a twentieth": 1 / 20, "a tenth": 1 / 10, "a fifth": 1 / 5}
 INTRO = """# A tenth of the time
 
 Made by `python benchmarks/tenth.py DATA`: `paper` to its end, and `default` with parts of the seconds that it took. Protocol P3, mean of
-the test views, all held out; one thread of a shared machine, one after the other, and not all bases on the same machine. The seconds are
-those of the whole, with merging, the closed form and validation. A run ends with the step and the check in which its part is used up, and
-where the start alone takes longer, that is judged.
+the test views, all held out; one thread of a shared machine, one after the other. The seconds are those of the whole, with merging, the closed form and validation. A run
+ends with the step and the check in which its part is used up, and where the start alone takes longer, that is judged.
 """
 
 
@@ -60,7 +59,7 @@ def main(
         views: How many of the test views are judged.
     """
     torch.set_num_threads(1)
-    for base in only or SCALES:
+    for base in bases_of(data, only):
         model = wrap_model(data / "checkpoints" / "bases" / base)
         judged = test_views(load_scene(data / "images" / base.split("_")[0]), model.cameras, model.background)[:views]
         judge = Evaluator(judged, PROTOCOLS["P3"], None, base)
