@@ -9,7 +9,6 @@ recipes that are not measured again are kept.
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from collections.abc import Sequence
@@ -17,9 +16,10 @@ from pathlib import Path
 
 import torch
 import tyro
-from pages import write_page
+from bases import photographs_of
+from rows import earlier, write_page
 
-from mipmap_plugin import load_scene, wrap_model
+from mipmap_plugin import wrap_model
 from mipmap_plugin.evaluation.evaluate import Row, all_rows, evaluator_of
 from mipmap_plugin.evaluation.report import records, table
 from mipmap_plugin.formats.atomic import write_json
@@ -67,8 +67,8 @@ def main(
     for base in bases:
         recipes = recipe or (RECIPES if max(SCALES[base]) > 1 else (*RECIPES, "thorough"))
         wrapped = wrap_model(data / "checkpoints" / "bases" / base, backend=backend)
-        scene = load_scene(data / "images" / base.split("_")[0])
-        rows = kept(output / f"{base}.json", recipes) + all_rows(wrapped, evaluator_of(wrapped, scene, "P3"), SCALES[base], recipes)
+        judge = evaluator_of(wrapped, photographs_of(data, base), "P3")
+        rows = kept(output / f"{base}.json", recipes) + all_rows(wrapped, judge, SCALES[base], recipes)
         rows.sort(key=lambda row: (abs(math.log2(row.scale)), recipe_of(row) is not None))
         write_json(output / f"{base}.json", records(rows), overwrite=True)
         print(f"{base}\n{table(rows)}\n", flush=True)
@@ -77,8 +77,7 @@ def main(
 
 def kept(file: Path, measured: Sequence[str]) -> list[Row]:
     """The rows of an earlier run that are not measured again."""
-    rows = [Row(**row) for row in json.loads(file.read_text())] if file.exists() else []
-    return [row for row in rows if recipe_of(row) not in (None, *measured)]
+    return [row for row in earlier(file, Row) if recipe_of(row) not in (None, *measured)]
 
 
 def recipe_of(row: Row) -> str | None:

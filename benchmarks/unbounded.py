@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 import tyro
-from pages import write_page
+from rows import write_page
 from torch import Tensor
 
 from mipmap_plugin import Camera, wrap_model
@@ -123,10 +123,10 @@ def judges(base: Wrapped, capture: Capture, name: str, scale: float, cameras: Se
 
 def free_rows(base: Wrapped, judge: Evaluator, scale: float) -> list[Row]:
     """Everything that needs no adapting, but what is the truth itself."""
-    finest, count = math.ceil(1 / scale), len(base.model.gaussians(base.any_camera()))
+    finest = math.ceil(1 / scale)
     found = baselines(base, scale, judge.protocol.shrink_by, filters=("scaled", "window"), samples=sorted({2, finest}) if scale < 1 else ())
     truth = {AVERAGED: (RESIZED, f"supersampling, {finest} x {finest}"), BICUBIC: (RESIZED,)}.get(judge.protocol, ())
-    return [judge.row(baseline.name, scale, baseline.render, gaussians=count) for baseline in found if baseline.name not in truth]
+    return [judge.row(baseline.name, scale, baseline.render, gaussians=baseline.gaussians) for baseline in found if baseline.name not in truth]
 
 
 def recipes(capture: Capture, scale: float) -> dict[str, dict[str, Any]]:

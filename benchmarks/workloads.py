@@ -128,12 +128,15 @@ def split_into(gaussians: Gaussians, count: int) -> Gaussians:
 def of_gaussians(name: str, gaussians: Gaussians, camera: Camera) -> Workload:
     if gaussians.covariances is not None:
         raise SettingsError(f"{name}: its family gives covariances, which have no raw parameters to measure from; take another checkpoint")
-    raw = {
-        "means": gaussians.means, "log_scales": gaussians.scales.log(), "quats": gaussians.quats,
-        "logits": gaussians.opacities.logit(eps=1e-6), "sh": gaussians.sh,
-    }  # fmt: skip
+    raw = raw_of(gaussians)
     weights = torch.randn(*camera.size, 3, generator=torch.Generator().manual_seed(0))
     return Workload(name, raw, camera, weights, count_pairs(activated(raw), camera))
+
+
+def raw_of(gaussians: Gaussians) -> dict[str, Tensor]:
+    """The raw parameters of splats, of which `activated` makes them."""
+    g = gaussians
+    return {"means": g.means, "log_scales": g.scales.log(), "quats": g.quats, "logits": g.opacities.logit(eps=1e-6), "sh": g.sh}
 
 
 def activated(raw: dict[str, Tensor]) -> Gaussians:
