@@ -19,4 +19,4 @@ def photographs_of(data: Path, base: str) -> Scene:
 
 def judge_of(wrapped: Wrapped, data: Path, base: str, most: int | None = None, perceptual: Perceptual | None = None) -> Evaluator:
     """What judges a base by its test photographs, at most the first `most`, by protocol P3."""
-    return Evaluator(photographed_views(wrapped, photographs_of(data, base))[:most], PROTOCOLS["P3"], perceptual, base)
+    return Evaluator(photographed_views(wrapped, wrapped.place(photographs_of(data, base)))[:most], PROTOCOLS["P3"], perceptual, base)

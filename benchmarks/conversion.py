@@ -68,7 +68,7 @@ def prepared(name: str, data: Path | None) -> tuple[Wrapped, Callable[[float], C
     if data is None:
         raise SystemExit(f"{name} needs DATA, or there is no such capture; known are {', '.join((*CAPTURES, *BASES))}")
     base = wrap_model(data / "checkpoints" / BASES[name], threads=1)
-    shots = evenly(photographed_views(base, photographs_of(data, name)), JUDGED)
+    shots = evenly(photographed_views(base, base.place(photographs_of(data, name))), JUDGED)
 
     def by_photographs(scale: float) -> Callable[[RenderView], float]:
         p3 = PROTOCOLS["P3"]

@@ -195,7 +195,7 @@ def changes(dolly: Dolly, ours: Show, viewer: str) -> list[Change]:
 def dolly_of(base: Wrapped, images: Path) -> Dolly:
     """The dolly, seen from test views with photographs where the images lie there, else from random views between the base's own."""
     if images.is_dir():
-        shots = photographed_views(base, load_scene(images))[VIEWS]
+        shots = photographed_views(base, base.place(load_scene(images)))[VIEWS]
         return Dolly(base, [shot.camera for shot in shots], shots)
     return Dolly(base, jittered(base.views(), RANDOM_VIEWS, torch.Generator().manual_seed(SEED)))
 

@@ -132,7 +132,7 @@ def main(
     pictures.mkdir(parents=True, exist_ok=True)
     for base in only or BASES:
         wrapped = wrap_model(data / "checkpoints" / "bases" / base)
-        views = photographed_views(wrapped, photographs_of(data, base))[VIEWS]
+        views = photographed_views(wrapped, wrapped.place(photographs_of(data, base)))[VIEWS]
         for at in scale or SCALES:
             with tempfile.TemporaryDirectory() as folder, Browser() as browser:
                 work = Work(wrapped, at, Path(folder))
