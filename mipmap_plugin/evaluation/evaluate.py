@@ -158,9 +158,7 @@ def adapted_row(name: str, adapted: Adapted, judge: Evaluator) -> Row:
     return worst([row(viewer) for viewer in adapted.viewers])[0]
 
 
-def evaluator_of(
-    model: Wrapped, scene: Scene, protocol: str, perceptual: Perceptual | None = None, cells: Cells | None = None
-) -> Evaluator:
+def evaluator_of(model: Wrapped, scene: Scene, protocol: str, perceptual: Perceptual | None = None, cells: Cells | None = None) -> Evaluator:
     """What compares a model with the photographs of its scene; `cells`: where finished rows are kept. Raises SettingsError."""
     if protocol not in (names := [*PROTOCOLS]):
         raise SettingsError(unknown("protocol", str(protocol), names))
