@@ -17,12 +17,10 @@ from pathlib import Path
 import torch
 import tyro
 from bases import photographs_of
-from rows import earlier, write_page
+from rows import earlier, write_page, write_rows
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.evaluation.evaluate import Row, all_rows, evaluator_of
-from mipmap_plugin.evaluation.report import records, table
-from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.recipes import RECIPES as KNOWN
 
 # The scales that each base was trained for the study of; see its own page. Those of lego at 400 px are of `gpu_bases.py`.
@@ -70,8 +68,7 @@ def main(
         judge = evaluator_of(wrapped, photographs_of(data, base), "P3")
         rows = kept(output / f"{base}.json", recipes) + all_rows(wrapped, judge, SCALES[base], recipes)
         rows.sort(key=lambda row: (abs(math.log2(row.scale)), recipe_of(row) is not None))
-        write_json(output / f"{base}.json", records(rows), overwrite=True)
-        print(f"{base}\n{table(rows)}\n", flush=True)
+        write_rows(output / f"{base}.json", rows)
     write_page(output / "real_bases.md", INTRO, output.glob("*_[0-9]*.json"))
 
 

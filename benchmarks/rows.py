@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from mipmap_plugin.evaluation.evaluate import Row
-from mipmap_plugin.evaluation.report import markdown, table
+from mipmap_plugin.evaluation.report import markdown, records, table
 from mipmap_plugin.formats.atomic import new_file, write_json
 
 Measured = TypeVar("Measured")
@@ -32,6 +32,12 @@ def write_table(folder: Path, name: str, intro: str, head: Sequence[str], rows: 
     with new_file(folder / f"{name}.md", overwrite=True) as file:
         file.write_text(text)
     write_json(folder / f"{name}.json", [asdict(row) for row in rows], overwrite=True)
+
+
+def write_rows(file: Path, rows: Sequence[Row]) -> None:
+    """Write evaluated rows, and print them under the file's name."""
+    write_json(file, records(rows), overwrite=True)
+    print(f"{file.stem}\n{table(rows)}\n", flush=True)
 
 
 def write_page(page: Path, intro: str, measured: Iterable[Path]) -> None:

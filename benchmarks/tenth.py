@@ -14,13 +14,11 @@ import torch
 import tyro
 from bases import judge_of
 from real_bases import SCALES
-from rows import write_page
+from rows import write_page, write_rows
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.evaluation.evaluate import Evaluator, Row, adapted_row
 from mipmap_plugin.evaluation.measure import adapt_alone
-from mipmap_plugin.evaluation.report import records, table
-from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.wrap import Wrapped
 
 # Parts of `paper`'s seconds that `default` gets.
@@ -64,8 +62,7 @@ def main(
         model = wrap_model(data / "checkpoints" / "bases" / base)
         judge = judge_of(model, data, base, views)
         rows = [row for scale in SCALES[base] if scale != 1 for row in rows_of(model, judge, scale)]
-        write_json(output / "tenth" / f"{base}.json", records(rows), overwrite=True)
-        print(f"{base}\n{table(rows)}\n", flush=True)
+        write_rows(output / "tenth" / f"{base}.json", rows)
     write_page(output / "tenth.md", INTRO, output.glob("tenth/*.json"))
 
 

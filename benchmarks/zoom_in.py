@@ -16,15 +16,13 @@ from typing import Literal
 import torch
 import tyro
 from bases import judge_of
-from rows import earlier, write_page
+from rows import earlier, write_page, write_rows
 from zoom_in_plot import draw
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.evaluation.evaluate import Evaluator, Row, adapted_row
 from mipmap_plugin.evaluation.measure import BASE, adapt_alone, resized_base, splats_shown, warm_up
 from mipmap_plugin.evaluation.perceptual import Perceptual
-from mipmap_plugin.evaluation.report import records, table
-from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.wrap import Wrapped
 
 INTRO = """# Zoom-in: dB against LPIPS
@@ -116,8 +114,7 @@ def main(
             rows += rows_of(model, judge, each)
             files = [data / "upsamplers" / name for name in NETWORKS[each]]
             rows += network_rows(model, judge, each, files, steps) if networks else kept(file, each)
-        write_json(file, records(rows), overwrite=True)
-        print(f"{table(rows)}\n", flush=True)
+        write_rows(file, rows)
     measured = sorted(output.glob("zoom_in/*.json"))
     write_page(output / "zoom_in.md", INTRO, measured)
     draw(output / "zoom_in.png", {file.stem: earlier(file, Row) for file in measured})
