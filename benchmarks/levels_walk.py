@@ -165,8 +165,7 @@ def mixtures(scene: Scene, base: Wrapped, ladders: Path, name: str, folder: Path
         print(f"{TOOL} is not found, so that its levels are left out", file=sys.stderr)
         return found
     counts = [len(level) for level in ours.levels[1:]]
-    files = [decimated(tool, source, count, folder / f"rival_{count}.ply") for count in dict.fromkeys(counts)]
-    by_count = {count: splats_of(scene, file) for count, file in zip(dict.fromkeys(counts), files, strict=True)}
+    by_count = {count: splats_of(scene, decimated(tool, source, count, folder / f"rival_{count}.ply")) for count in dict.fromkeys(counts)}
     return {**found, TOOL: Mixture.of(ours.rule, scene.chunks, [scene.splats, *(by_count[count] for count in counts)])}
 
 
