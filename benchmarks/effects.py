@@ -69,7 +69,7 @@ class Cost:
 class Bench:
     """A scene of `scenes.py`, drawn by one backend."""
 
-    def __init__(self, backend: str, name: Name = "A") -> None:
+    def __init__(self, backend: str, name: Name) -> None:
         scene = make(name)
         raw = {name: torch.from_numpy(array) for name, array in scene.raw.items()}
         named = {"means": raw["means"], "scales": raw["log_scales"], "quats": raw["quats"], "opacities": raw["logits"]}
