@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -40,6 +41,24 @@ class Workload:
     def load(cls, path: Path) -> Workload:
         facts = torch.load(path, weights_only=True)
         return cls(**facts | {"camera": Camera(**facts["camera"])})
+
+
+@dataclass(frozen=True, eq=False)
+class Passes:
+    """What is timed: from `raw` to an image, and back from sum(image * weights)."""
+
+    raw: dict[str, Tensor]  # that require gradients
+    weights: Tensor  # [H, W, 3]
+    render: Callable[[Gaussians], Tensor]
+
+    def forward(self) -> None:
+        with torch.no_grad():
+            self.render(activated(self.raw))
+
+    def forward_backward(self) -> None:
+        for leaf in self.raw.values():
+            leaf.grad = None
+        (self.render(activated(self.raw)) * self.weights).sum().backward()
 
 
 @dataclass(frozen=True)
