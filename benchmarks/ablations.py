@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import tyro
+from bases import judge_of
 
-from mipmap_plugin import load_scene, wrap_model
+from mipmap_plugin import wrap_model
 from mipmap_plugin.commands.types import Scale
-from mipmap_plugin.evaluation.evaluate import Evaluator, adapted_row
+from mipmap_plugin.evaluation.evaluate import adapted_row
 from mipmap_plugin.evaluation.measure import adapt_alone, warm_up
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
 from mipmap_plugin.evaluation.report import table
 from mipmap_plugin.formats.atomic import new_file
 from mipmap_plugin.recipes import recipe as make_config
@@ -65,8 +65,7 @@ def main(
         backend: A backend's name.
     """
     wrapped = wrap_model(data / "checkpoints" / "bases" / base, backend=backend)
-    scene = wrapped.place(load_scene(data / "images" / base.split("_")[0]))
-    evaluator = Evaluator(test_views(scene, wrapped.cameras, wrapped.background), PROTOCOLS["P3"], scene=scene.source.name)
+    evaluator = judge_of(wrapped, data, base)
     scored = dict(views="given", cameras=[view.camera for view in evaluator.views])
     warm_up(wrapped, scale, wrapped.cameras)
     for name in only or ABLATIONS:

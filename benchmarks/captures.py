@@ -10,24 +10,23 @@ are not measured again are kept. Three minutes.
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
 import torch
 import tyro
 from made_captures import CAPTURES, Capture
+from rows import joined, write_table
 from torch import Tensor
 
 from mipmap_plugin import Camera
 from mipmap_plugin.adaptation.curve import decibel
 from mipmap_plugin.adaptation.optimization.validation import VISIBLE_ERROR
 from mipmap_plugin.adaptation.target.resize import resize
-from mipmap_plugin.evaluation.report import markdown
-from mipmap_plugin.formats.atomic import new_file, write_json
+from mipmap_plugin.evaluation.measure import RenderView
 from mipmap_plugin.wrap import Wrapped
 
 SCALES = (1 / 4, 1 / 8, 2.0)
@@ -40,8 +39,6 @@ averaged itself and compared with it. *2 x 2*: the mean of so many samples a pix
 changes any view of the base's by, in dB as far as differences can be seen (below two steps of 8 bits, 42 dB, they hardly count). One thread of a
 shared machine.
 """
-
-Show = Callable[[Camera], Tensor]  # a camera of the base scale -> [h, w, 3]
 
 
 @dataclass(frozen=True)
@@ -75,7 +72,7 @@ class Views:
         return resize(image.clamp(0, 1), camera.zoomed(self._shown_at).size, "area")
 
     @torch.no_grad()
-    def errors(self, show: Show) -> list[float]:
+    def errors(self, show: RenderView) -> list[float]:
         """The mean square error of each view."""
         images = [self._shrunk(show(camera), camera) for camera in self._cameras]
         return [float((image - truth).square().mean()) for image, truth in zip(images, self._truths, strict=True)]
@@ -97,13 +94,6 @@ def measure(name: str, capture: Capture, scale: float, seed: int) -> Row:
     report = adapted["default"].report
     psnrs = {of: fmean(map(decibel, each)) for of, each in errors.items()}
     return Row(name, scale, seed, psnrs, least, report.gaussians_after / report.gaussians_before, report.seconds["total"], report.returned)
-
-
-def joined(file: Path, rows: Sequence[Row]) -> list[Row]:
-    """These rows, and those of an earlier run that were not measured again."""
-    earlier = [Row(**row) for row in json.loads(file.read_text())] if file.exists() else []
-    known = {(row.capture, row.scale, row.seed): row for row in (*earlier, *rows)}
-    return sorted(known.values(), key=lambda row: (list(CAPTURES).index(row.capture), abs(math.log2(row.scale)), row.scale, row.seed))
 
 
 def main(
@@ -129,12 +119,9 @@ def main(
         for each in scale or SCALES:
             rows += [measure(name, capture, each, number) for number in seed or (0,)]
             print(*rows[-1].cells(), rows[-1].returned, sep="  ", flush=True)
-    rows = joined(output / "captures.json", rows)
-    text = INTRO + "\n" + markdown(HEAD, [row.cells() for row in rows]) + "\n"
-    print(f"\n{text}")
-    with new_file(output / "captures.md", overwrite=True) as file:
-        file.write_text(text)
-    write_json(output / "captures.json", [asdict(row) for row in rows], overwrite=True)
+    rows = joined(output / "captures.json", Row, rows, lambda row: (row.capture, row.scale, row.seed))
+    rows.sort(key=lambda row: (list(CAPTURES).index(row.capture), abs(math.log2(row.scale)), row.scale, row.seed))
+    write_table(output, "captures", INTRO, HEAD, rows)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 
@@ -18,7 +17,8 @@ import torch
 import tyro
 from torch import Tensor
 
-from mipmap_plugin import Camera, wrap_model
+from mipmap_plugin import wrap_model
+from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.report import markdown
@@ -76,24 +76,18 @@ def of_mip_splatting(plain: Wrapped, folder: Path) -> Wrapped:
 def qualities(base: Wrapped, scale: float) -> list[float]:
     """dB of the base in its own renderer, of `instant` there, and the same in classic."""
     own, classic = base.adapt(scale, recipe="instant"), base.adapt(scale, recipe="instant", viewer="classic")
-    views = base.cameras[VIEWS]
-    drawn = [
-        [base.render(view.zoomed(scale)).image for view in views],
-        [own.render(view.zoomed(scale)).image for view in views],
-        [base.render(view.zoomed(scale), viewer="classic").image for view in views],
-        [classic.render(view.zoomed(scale)).image for view in views],
-    ]
-    return [against(base, views, images) for images in drawn]
+    truths = {view: base.render(view).image for view in base.cameras[VIEWS]}
+
+    def quality(model: Wrapped | Adapted, **options: str) -> float:
+        return fmean(against(truth, model.render(view.zoomed(scale), **options).image) for view, truth in truths.items())
+
+    return [quality(base), quality(own), quality(base, viewer="classic"), quality(classic)]
 
 
-def against(base: Wrapped, views: Sequence[Camera], images: Sequence[Tensor]) -> float:
-    """Mean dB of images against the base's own at x1."""
-    found = []
-    for view, image in zip(views, images, strict=True):
-        truth = base.render(view).image
-        size = min(image.shape[0], truth.shape[0]), min(image.shape[1], truth.shape[1])
-        found.append(psnr(*(resize(each.detach().clamp(0, 1), size, "area") for each in (image, truth))))
-    return fmean(found)
+def against(truth: Tensor, image: Tensor) -> float:
+    """dB of an image against another, both shrunk to the smaller of the two."""
+    size = min(image.shape[0], truth.shape[0]), min(image.shape[1], truth.shape[1])
+    return psnr(*(resize(each.detach().clamp(0, 1), size, "area") for each in (image, truth)))
 
 
 if __name__ == "__main__":

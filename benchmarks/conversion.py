@@ -10,25 +10,24 @@ measured again are kept. Half an hour; the captures alone take twenty minutes.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 
 import torch
 import tyro
+from bases import photographs_of
 from captures import Views
 from made_captures import CAPTURES
-from torch import Tensor
+from rows import joined, write_table
 
-from mipmap_plugin import Camera, load_scene, wrap_model
+from mipmap_plugin import Camera, wrap_model
 from mipmap_plugin.adaptation.curve import decibel
 from mipmap_plugin.camera import evenly
+from mipmap_plugin.evaluation.measure import RenderView
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, photographed_views
-from mipmap_plugin.evaluation.report import markdown
-from mipmap_plugin.formats.atomic import new_file, write_json
 from mipmap_plugin.wrap import Wrapped
 
 VIEWERS, SCALES = ("spark", "playcanvas"), (2.0, 4.0)
@@ -41,8 +40,6 @@ Made by `python benchmarks/conversion.py DATA`: mean PSNR (dB) of views that not
 *without*: `default` with `conversion_steps=0`. *with*: `default`, which first learns at x1 how the viewer draws. Lego and chair against photographs
 (protocol P3), all others against the base's own image, to whose size the zoom-in is averaged. One thread of a shared machine.
 """
-
-Show = Callable[[Camera], Tensor]  # a camera of the base scale -> [h, w, 3]
 
 
 @dataclass(frozen=True)
@@ -63,7 +60,7 @@ class Row:
         return [self.scene, self.viewer, f"x{self.scale:g}", *quality, f"{self.seconds_without:.0f}", f"{self.seconds_with:.0f}"]
 
 
-def prepared(name: str, data: Path | None) -> tuple[Wrapped, Callable[[float], Callable[[Show], float]]]:
+def prepared(name: str, data: Path | None) -> tuple[Wrapped, Callable[[float], Callable[[RenderView], float]]]:
     """A base, and what judges it: a zoom -> (what is shown -> dB)."""
     if name in CAPTURES:
         capture = CAPTURES[name]()
@@ -71,10 +68,9 @@ def prepared(name: str, data: Path | None) -> tuple[Wrapped, Callable[[float], C
     if data is None:
         raise SystemExit(f"{name} needs DATA, or there is no such capture; known are {', '.join((*CAPTURES, *BASES))}")
     base = wrap_model(data / "checkpoints" / BASES[name], threads=1)
-    scene = load_scene(data / "images" / name.split("_")[0])
-    shots = evenly(photographed_views(base, scene), JUDGED)
+    shots = evenly(photographed_views(base, base.place(photographs_of(data, name))), JUDGED)
 
-    def by_photographs(scale: float) -> Callable[[Show], float]:
+    def by_photographs(scale: float) -> Callable[[RenderView], float]:
         p3 = PROTOCOLS["P3"]
         truths = [(shot.camera, shot.truth(scale, p3)) for shot in shots]
         return lambda show: fmean(psnr(p3.as_saved(show(camera)), truth) for camera, truth in truths)
@@ -82,7 +78,7 @@ def prepared(name: str, data: Path | None) -> tuple[Wrapped, Callable[[float], C
     return base, by_photographs
 
 
-def by_itself(base: Wrapped, cameras: Sequence[Camera], scale: float) -> Callable[[Show], float]:
+def by_itself(base: Wrapped, cameras: Sequence[Camera], scale: float) -> Callable[[RenderView], float]:
     """What judges a zoom-in by the base's own images."""
     views = Views(base, cameras, scale)
     return lambda show: fmean(map(decibel, views.errors(show)))
@@ -102,13 +98,6 @@ def measure(name: str, data: Path | None, viewers: Sequence[str], scales: Sequen
     return rows
 
 
-def joined(file: Path, rows: Sequence[Row]) -> list[Row]:
-    """These rows, and those of an earlier run that were not measured again."""
-    earlier = [Row(**row) for row in json.loads(file.read_text())] if file.exists() else []
-    known, names = {(row.scene, row.viewer, row.scale): row for row in (*earlier, *rows)}, [*BASES, *CAPTURES]
-    return sorted(known.values(), key=lambda row: (names.index(row.scene), row.viewer, row.scale))
-
-
 def main(
     data: tyro.conf.Positional[Path | None] = None,
     only: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
@@ -126,13 +115,11 @@ def main(
         output: Where conversion.md and conversion.json go.
     """
     torch.set_num_threads(1)
-    rows = [row for name in only or (*(BASES if data else ()), *CAPTURES) for row in measure(name, data, viewer or VIEWERS, scale or SCALES)]
-    rows = joined(output / "conversion.json", rows)
-    text = INTRO + "\n" + markdown(HEAD, [row.cells() for row in rows]) + "\n"
-    with new_file(output / "conversion.md", overwrite=True) as file:
-        file.write_text(text)
-    write_json(output / "conversion.json", [asdict(row) for row in rows], overwrite=True)
-    print(f"\n{text}")
+    names = [*BASES, *CAPTURES]
+    rows = [row for name in only or (names if data else CAPTURES) for row in measure(name, data, viewer or VIEWERS, scale or SCALES)]
+    rows = joined(output / "conversion.json", Row, rows, lambda row: (row.scene, row.viewer, row.scale))
+    rows.sort(key=lambda row: (names.index(row.scene), row.viewer, row.scale))
+    write_table(output, "conversion", INTRO, HEAD, rows)
 
 
 if __name__ == "__main__":

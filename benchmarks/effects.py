@@ -69,7 +69,7 @@ class Cost:
 class Bench:
     """A scene of `scenes.py`, drawn by one backend."""
 
-    def __init__(self, backend: str, name: Name = "A") -> None:
+    def __init__(self, backend: str, name: Name) -> None:
         scene = make(name)
         raw = {name: torch.from_numpy(array) for name, array in scene.raw.items()}
         named = {"means": raw["means"], "scales": raw["log_scales"], "quats": raw["quats"], "opacities": raw["logits"]}
@@ -187,7 +187,8 @@ def _adapting(bench: Bench) -> Iterator[Pair]:
 
 def measure(pair: Pair, runs: int) -> tuple[Cost, Cost | None, float]:
     """Milliseconds forward, and forward with backward; and the largest difference of the two images."""
-    difference = float((pair.on() - pair.off()).detach().abs().max()) if pair.on().shape == pair.off().shape else float("nan")
+    on, off = pair.on().detach(), pair.off().detach()
+    difference = float((on - off).abs().max()) if on.shape == off.shape else float("nan")
 
     def forward(draw: Draw) -> None:
         with torch.set_grad_enabled(not pair.backward):  # adapting needs its gradients
@@ -199,22 +200,26 @@ def measure(pair: Pair, runs: int) -> tuple[Cost, Cost | None, float]:
 
 
 def _in_turn(calls: list[Callable[[], None]], runs: int) -> Cost:
-    spent: list[list[float]] = [[] for _ in calls]
-    for run in range(runs + 1):
-        for call, times in zip(calls, spent, strict=True):
-            began = time.process_time()
-            call()
-            if run:  # the first is for warming up
-                times.append(1000 * (time.process_time() - began))
-    return Cost(*(statistics.median(times) for times in spent))
+    rounds = [[_milliseconds(call) for call in calls] for _ in range(runs + 1)]
+    return Cost(*map(statistics.median, zip(*rounds[1:], strict=True)))  # the first is for warming up
+
+
+def _milliseconds(call: Callable[[], None]) -> float:
+    began = time.process_time()
+    call()
+    return 1000 * (time.process_time() - began)
 
 
 def row(pair: Pair, runs: int) -> list[str]:
     ahead, both, difference = measure(pair, runs)
-    costs = [f"{c.on_ms:.1f}" if c else "-" for c in (ahead, both)], [f"{c.off_ms:.1f}" if c else "-" for c in (ahead, both)]
-    ratios = [f"{c.on_ms / c.off_ms:.2f}" if c and c.off_ms > 0.1 else "-" for c in (ahead, both)]
-    change = pair.change if pair.needed else f"{difference:.0e}"
-    return [pair.effect, pair.scene, costs[0][0], costs[1][0], ratios[0], costs[0][1], costs[1][1], ratios[1], change]
+    return [pair.effect, pair.scene, *_cells(ahead), *_cells(both), pair.change if pair.needed else f"{difference:.0e}"]
+
+
+def _cells(cost: Cost | None) -> list[str]:
+    """On, off, and their ratio."""
+    if cost is None:
+        return ["-"] * 3
+    return [f"{cost.on_ms:.1f}", f"{cost.off_ms:.1f}", f"{cost.on_ms / cost.off_ms:.2f}" if cost.off_ms > 0.1 else "-"]
 
 
 def main(output: Path = Path("benchmarks/results/effects.md"), backend: str = "auto", scene: Name = "A", runs: int = 7) -> None:

@@ -27,7 +27,6 @@ import tyro
 from mipmap_plugin.formats.atomic import write_json
 
 RESULTS = Path(__file__).parent / "results"
-COMMAND = "import sys; from mipmap_plugin.cli import main; sys.exit(main())"
 SCENES = ("bases/lego_100", "bases/lego_200", "bases/chair_100", "flowers_r8")
 
 # The longest pause, in seconds, between two kills.
@@ -59,7 +58,7 @@ def adapted(scenes: list[str], options: list[str], chance: random.Random | None 
     with tempfile.TemporaryDirectory() as folder:
         words = ["adapt", *scenes, "--scale", "1/2", "--scale", "1/4", "--threads", "1", "--output", folder, "--quiet", *options]
         began = time.perf_counter()
-        process = subprocess.Popen([sys.executable, "-c", COMMAND, *words], stdout=subprocess.DEVNULL)
+        process = subprocess.Popen([sys.executable, "-m", "mipmap_plugin", *words], stdout=subprocess.DEVNULL)
         killed: list[float] = []
         killer = threading.Thread(target=kill_workers, args=(process, chance, most, killed), daemon=True) if chance else None
         if killer:

@@ -64,9 +64,9 @@ class Request:
     runs: int
     processes: int
     ends: float  # of `time.monotonic`
-    device: str = "cuda"
-    parts: Sequence[Part] = tuple(UNTIL)
-    began: float = 0.0
+    device: str
+    parts: Sequence[Part]
+    began: float
 
 
 def main(

@@ -11,15 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from bases import judge_of
 from gpu_records import Adaptation
 from gpu_work import Work, kept
 from workloads import split_into
 
-from mipmap_plugin import load_model, load_scene, wrap_model
+from mipmap_plugin import load_model, wrap_model
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.evaluation.evaluate import Evaluator, adapted_row
 from mipmap_plugin.evaluation.measure import adapt_alone
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, photographed_views
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import Wrapped
@@ -95,11 +95,8 @@ class Subject:
         cameras = wrap_model(here).cameras
         model = here.to(place.device)
         wrapped = wrap_model(model if base.splats is None else denser(model, base.splats), cameras=cameras, backend=place.backend)
-        images = place.data / "images" / base.name.split("_")[0]
-        judge = None
-        if images.is_dir():
-            judge = Evaluator(photographed_views(wrapped, load_scene(images)), PROTOCOLS["P3"])
-        return cls(base, wrapped, judge, place)
+        is_judged = (place.data / "images" / base.name.split("_")[0]).is_dir()
+        return cls(base, wrapped, judge_of(wrapped, place.data, base.name) if is_judged else None, place)
 
     def adapted(self, scale: float, viewer: str = "") -> Adaptation:
         """Adapt it, twice where that is quick."""

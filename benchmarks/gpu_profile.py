@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 from gpu_records import Kernel, Profile
-from gpu_speed import Case, Scene, calls, scene_of, title
+from gpu_speed import Case, Scene, passes, scene_of, title
 from gpu_work import Work
 from torch.profiler import ProfilerActivity, profile
 from workloads import activated, effects_of
@@ -29,7 +29,7 @@ OCCUPANCY, REGISTERS = "est. achieved occupancy %", "registers per thread"
 def profile_one(name: str, case: Case, device: str, cases: Sequence[Case]) -> Iterator[Profile]:
     """One backend on one case, with classic dilation."""
     scene = scene_of(case, device, cases)
-    spent = kernels(calls(get_backend(name), scene, "classic")[1], least_bytes(scene) if name == "triton" else {})
+    spent = kernels(passes(get_backend(name), scene, "classic").forward_backward, least_bytes(scene) if name == "triton" else {})
     yield Profile(name, *case, round(sum(kernel.us for kernel in spent), 1), spent[:KERNELS])
 
 

@@ -116,8 +116,7 @@ def report(results: Results) -> str:
     made = "Made by `python benchmarks/gpu.py --data DATA`"
     lines = [f"# {known['device']}", f"{made}; {machine}.{copied}", speed_table(results.speed, results.bandwidth), views_table(results.views)]
     lines += [adaptation_table(results.adaptation), first_use_table(results.first_uses), conformance_table(results.conformance)]
-    lines += [profile_table(results.profiles, results.bandwidth)]
-    lines += [not_measured(results.failures)]
+    lines += [profile_table(results.profiles, results.bandwidth), not_measured(results.failures)]
     return "\n\n".join(filter(None, lines))
 
 

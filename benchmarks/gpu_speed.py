@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -17,7 +17,7 @@ from gpu_work import Work, kept
 from scenes import Scene as Generated
 from scenes import Spec, make_to
 from torch import Tensor
-from workloads import activated, effects_of
+from workloads import Passes, effects_of
 
 from mipmap_plugin.adaptation.renderers import unrounded
 from mipmap_plugin.backends.base import Backend, Needs
@@ -136,30 +136,16 @@ def works(backends: Sequence[str], cases: Sequence[Case], device: str, runs: int
 def measure(backend: Backend, scene: Scene, device: str, runs: int, mode: Mode = "classic") -> Speed:
     """Raw parameters -> image, without a graph; and -> image -> gradients of all of them."""
     clock, (height, width) = Clock(device), scene.camera.size
-    forward, both = calls(backend, scene, mode)
-    both()  # compiles what is to be compiled
-    peak = clock.peak_mib(both)
-    forward_ms, both_ms = clock.milliseconds(forward, runs), clock.milliseconds(both, runs)
+    job = passes(backend, scene, mode)
+    job.forward_backward()  # compiles what is to be compiled
+    peak = clock.peak_mib(job.forward_backward)
+    forward_ms, both_ms = clock.milliseconds(job.forward, runs), clock.milliseconds(job.forward_backward, runs)
     parameters, pixels = scene.parameter_bytes, 4 * width * height
     # The least that has to move: parameters are read, image and alpha written; on the way back both are read again, gradients written.
     least = (parameters + 4 * pixels, 3 * parameters + 2 * 4 * pixels)
     return Speed(backend.name, mode, len(scene.raw["means"]), width, height, forward_ms, both_ms, peak, *least)
 
 
-def calls(backend: Backend, scene: Scene, mode: Mode) -> tuple[Callable[[], None], Callable[[], None]]:
-    """What draws an image, and what draws it and takes it back to the parameters."""
-
-    def image() -> Tensor:
-        gaussians = activated(scene.raw)
-        return backend.render(gaussians, scene.camera, effects_in(mode, gaussians)).image
-
-    def forward() -> None:
-        with torch.no_grad():
-            image()
-
-    def both() -> None:
-        for leaf in scene.raw.values():
-            leaf.grad = None
-        (image() * scene.weights).sum().backward()
-
-    return forward, both
+def passes(backend: Backend, scene: Scene, mode: Mode) -> Passes:
+    """A backend on a scene in a mode."""
+    return Passes(scene.raw, scene.weights, lambda gaussians: backend.render(gaussians, scene.camera, effects_in(mode, gaussians)).image)

@@ -13,7 +13,7 @@ from gpu_records import Views
 from gpu_timing import Clock
 from gpu_work import Work, kept
 from torch import Tensor
-from workloads import activated, effects_of
+from workloads import activated, effects_of, raw_of
 
 from mipmap_plugin import Camera, Gaussians, load_model, wrap_model
 from mipmap_plugin.backends.base import AdamStep
@@ -31,8 +31,12 @@ NAMES = {"means": "means", "quats": "quats", "scales": "log_scales", "opacities"
 class Shots:
     """Raw parameters, and views of them of one size."""
 
-    raw: dict[str, Tensor]
+    raw: dict[str, Tensor]  # to be differentiated
     cameras: Sequence[Camera]
+
+    @classmethod
+    def of(cls, gaussians: Gaussians, cameras: Sequence[Camera]) -> Shots:
+        return cls({name: tensor.clone().requires_grad_() for name, tensor in raw_of(gaussians).items()}, cameras)
 
 
 @kept
@@ -40,7 +44,7 @@ def of_base(data: Path, device: str) -> Shots:
     """The raw parameters of the base, and its first views."""
     model = load_model(data / "checkpoints" / "bases" / BASE)
     cameras = wrap_model(model).cameras[: max(COUNTS)]
-    return Shots(raw_of(model.gaussians(cameras[0]).detach(), device), cameras)
+    return Shots.of(model.gaussians(cameras[0]).detach().to(device), cameras)
 
 
 def measure_views(name: str, width: int, data: Path, device: str, runs: int) -> Iterator[Views]:
@@ -57,15 +61,6 @@ def works(data: Path, backends: Sequence[str], device: str, runs: int) -> list[W
         Work("views", name, f"views of {width} px", EXPECTED_S, measure_views, (name, width, data, device, runs))
         for width in WIDTHS for name in with_itself(backends)
     ]  # fmt: skip
-
-
-def raw_of(gaussians: Gaussians, device: str) -> dict[str, Tensor]:
-    """The raw parameters of splats, to be differentiated."""
-    raw = {
-        "means": gaussians.means, "log_scales": gaussians.scales.log(), "quats": gaussians.quats,
-        "logits": gaussians.opacities.logit(eps=1e-6), "sh": gaussians.sh,
-    }  # fmt: skip
-    return {name: tensor.to(device).clone().requires_grad_() for name, tensor in raw.items()}
 
 
 def measure(name: str, shots: Shots, device: str, runs: int) -> Views:

@@ -21,6 +21,7 @@ from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import torch
 import tyro
@@ -194,15 +195,15 @@ def changes(dolly: Dolly, ours: Show, viewer: str) -> list[Change]:
 def dolly_of(base: Wrapped, images: Path) -> Dolly:
     """The dolly, seen from test views with photographs where the images lie there, else from random views between the base's own."""
     if images.is_dir():
-        shots = photographed_views(base, load_scene(images))[VIEWS]
+        shots = photographed_views(base, base.place(load_scene(images)))[VIEWS]
         return Dolly(base, [shot.camera for shot in shots], shots)
     return Dolly(base, jittered(base.views(), RANDOM_VIEWS, torch.Generator().manual_seed(SEED)))
 
 
-def ladder_of(base: Wrapped, viewer: str, folder: Path) -> Path:
-    """The ladder in a folder, made there if it is not yet."""
+def ladder_of(base: Wrapped, viewer: str, folder: Path, **options: Any) -> Path:
+    """The ladder in a folder, made there if it is not yet; `options`: of `Wrapped.levels`."""
     if not (folder / MANIFEST).is_file():
-        base.levels(viewer, coarsest=COARSEST, resume=state_path(folder)).save(folder)
+        base.levels(viewer, resume=state_path(folder), **options).save(folder)
     return folder
 
 
@@ -227,8 +228,9 @@ def shows(base: Wrapped, viewer: str, ladder: Path, folder: Path) -> list[Show]:
     return [*found, Show(TOOL, [base.model, *(load_model(file) for file in files)], switches, megabytes)]
 
 
-def decimated(tool: Sequence[str], source: Path, count: int, output: Path) -> Path:
-    subprocess.run([*tool, "--quiet", "--gpu", "cpu", str(source), "--decimate", str(count), str(output)], check=True)
+def decimated(tool: Sequence[str], source: Path, count: int, output: Path, option: str = "--decimate") -> Path:
+    """The rival's file of so many splats."""
+    subprocess.run([*tool, "--quiet", "--gpu", "cpu", str(source), option, str(count), str(output)], check=True)
     return output
 
 
@@ -257,7 +259,7 @@ def main(
         dolly = dolly_of(base, data / "images" / name.split("_")[0])
         truths = dolly.truths() if measure else {}
         for each in viewer or VIEWERS:
-            ladder = ladder_of(base, each, ladders / f"{name}_{each}")
+            ladder = ladder_of(base, each, ladders / f"{name}_{each}", coarsest=COARSEST)
             with tempfile.TemporaryDirectory() as folder:
                 shown = shows(base, each, ladder, Path(folder))
                 strip(output / "levels" / f"{name}_{each}.png", frames(dolly, shown, each), STRIP)

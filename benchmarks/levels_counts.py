@@ -11,9 +11,7 @@ measured again.
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -22,7 +20,8 @@ from statistics import fmean
 
 import torch
 import tyro
-from levels import Dolly, at
+from levels import Dolly, at, decimated
+from rows import earlier
 
 from mipmap_plugin import load_model, wrap_model
 from mipmap_plugin.adaptation.adapted import render_model
@@ -72,13 +71,16 @@ class Row:
 
 def measure(dolly: Dolly, file: Path, scales: Sequence[float], recipe: str) -> None:
     """Every count at every scale."""
-    found = [Row(**each) for each in json.loads(file.read_text())] if file.exists() else []
+    found = earlier(file, Row)
     source = dolly.base.model.source
     assert source is not None  # since the base was read from a file
     count = len(dolly.base.model.parameters()["means"])
     with tempfile.TemporaryDirectory() as folder:
         for fraction in FRACTIONS:
-            rivals = {name: load_model(decimated(source, option, round(count * fraction), Path(folder))) for name, option in RIVALS.items()}
+            rivals = dict[str, SplatModel]()
+            for name, option in RIVALS.items():
+                made = Path(folder) / f"{name}_{fraction}.ply"
+                rivals[name] = load_model(decimated(refuse_exchange(made), source, round(count * fraction), made, option))
             for scale in scales:
                 if (fraction, scale, recipe) not in {(each.fraction, each.scale, each.recipe) for each in found}:
                     found.append(row(dolly, rivals, fraction, scale, recipe))
@@ -104,12 +106,6 @@ def row(dolly: Dolly, rivals: dict[str, SplatModel], fraction: float, scale: flo
         fraction, len(ours.model.parameters()["means"]), scale, in_viewer(ours.model), ours.report.seconds["total"], in_viewer(dolly.base.model),
         {name: in_viewer(model) for name, model in rivals.items()}, {name: supersampled(model) for name, model in rivals.items()}, recipe,
     )  # fmt: skip
-
-
-def decimated(source: Path, option: str, count: int, folder: Path) -> Path:
-    made = folder / f"{option.strip('-')}_{count}.ply"
-    subprocess.run([*refuse_exchange(made), "--quiet", "--gpu", "cpu", str(source), option, str(count), str(made)], check=True)
-    return made
 
 
 def page(results: Mapping[str, Sequence[Row]]) -> str:
@@ -152,7 +148,7 @@ def main(
         kept = [camera for camera in whole.cameras if camera not in held_out]
         base = wrap_model(whole.model, cameras=kept, background=whole.background, threads=1)
         measure(Dolly(base, held_out), output / "levels_counts" / f"{name}.json", scale or SCALES, recipe)
-    results = {file.stem: [Row(**each) for each in json.loads(file.read_text())] for file in sorted((output / "levels_counts").glob("*.json"))}
+    results = {file.stem: earlier(file, Row) for file in sorted((output / "levels_counts").glob("*.json"))}
     (output / "levels_counts.md").write_text(page(results), encoding="utf-8")
 
 

@@ -22,7 +22,7 @@ from typing import Any
 
 import torch
 import tyro
-from levels import decimated
+from levels import decimated, ladder_of
 from torch import Tensor
 from tqdm import tqdm
 
@@ -41,7 +41,7 @@ from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground
 from mipmap_plugin.levels.manifest import CANVAS, MANIFEST
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.levels.streamed import distances, progression
-from mipmap_plugin.models.places import REPORT, state_path
+from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.scenes.trajectories import jittered
 from mipmap_plugin.wrap import Wrapped
 
@@ -141,13 +141,6 @@ def draw(scene: Scene, splats: Gaussians, camera: Camera) -> Tensor:
     return scene.backend.render(splats, camera, scene.target).image.clamp(0, 1)
 
 
-def ladder_of(base: Wrapped, by: str, folder: Path) -> Path:
-    """The ladder in a folder, made there if it is not yet."""
-    if not (folder / MANIFEST).is_file():
-        base.levels(VIEWER, coarsest=COARSEST, by=by, resume=state_path(folder)).save(folder)
-    return folder
-
-
 def mixture_of(scene: Scene, folder: Path) -> Mixture:
     """The levels of a ladder and PlayCanvas's rule with the distances that are closest to its switches."""
     manifest = json.loads((folder / MANIFEST).read_text())
@@ -162,20 +155,17 @@ def splats_of(scene: Scene, file: Path) -> Gaussians:
 
 def mixtures(scene: Scene, base: Wrapped, ladders: Path, name: str, folder: Path) -> dict[str, Mixture]:
     """All ways to show the scene."""
-    ours = mixture_of(scene, ladder_of(base, "distance", ladders / f"{name}_{VIEWER}_distance"))
-    alone = DistanceRule(1.0, 2.0, 1)
-    found = {
-        "by distance": ours,
-        "by zoom": mixture_of(scene, ladder_of(base, "zoom", ladders / f"{name}_{VIEWER}_zoom")),
-        "base": Mixture.of(alone, scene.chunks, [scene.splats]),
-    }
+    ours, by_zoom = (
+        mixture_of(scene, ladder_of(base, VIEWER, ladders / f"{name}_{VIEWER}_{by}", coarsest=COARSEST, by=by)) for by in ("distance", "zoom")
+    )
+    alone = Mixture.of(DistanceRule(1.0, 2.0, 1), scene.chunks, [scene.splats])
+    found = {"by distance": ours, "by zoom": by_zoom, "base": alone}
     source, tool = base.model.source, find_tool()
     if tool is None or source is None:
         print(f"{TOOL} is not found, so that its levels are left out", file=sys.stderr)
         return found
     counts = [len(level) for level in ours.levels[1:]]
-    files = [decimated(tool, source, count, folder / f"rival_{count}.ply") for count in dict.fromkeys(counts)]
-    by_count = {count: splats_of(scene, file) for count, file in zip(dict.fromkeys(counts), files, strict=True)}
+    by_count = {count: splats_of(scene, decimated(tool, source, count, folder / f"rival_{count}.ply")) for count in dict.fromkeys(counts)}
     return {**found, TOOL: Mixture.of(ours.rule, scene.chunks, [scene.splats, *(by_count[count] for count in counts)])}
 
 

@@ -95,11 +95,12 @@ class Builder:
         return Gaussians(*(torch.cat([getattr(part, column) for part in self._parts]) for column in columns))
 
 
-def looking(eye: ArrayLike, target: ArrayLike, field_of_view: float = 60, up: ArrayLike = (0, 0, 1)) -> Camera:
+def looking(eye: ArrayLike, target: ArrayLike, field_of_view: float = 60) -> Camera:
     """A camera at `eye` that looks at `target`; the horizontal field of view in degrees."""
     eye, forward = np.asarray(eye, dtype=float), np.asarray(target, dtype=float) - np.asarray(eye, dtype=float)
     forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
+    right = np.cross(forward, (0, 0, 1))
+    right /= np.linalg.norm(right)
     viewmat = np.eye(4)
     viewmat[:3, :3] = right, np.cross(forward, right), forward
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
@@ -142,9 +143,9 @@ def _object(builder: Builder) -> None:
     builder.surface((-1.2, -1.2, -0.02), (2.4, 0, 0), (0, 2.4, 0), 2000, cloudy(builder.rng, (0.5, 0.5, 0.5)))
 
 
-def _around(number: float, count: int, field_of_view: float = 45) -> Camera:
+def _around(number: float, count: int) -> Camera:
     turn, rise = 2 * np.pi * number / count, 0.25 + 0.5 * (number * 0.618 % 1)
-    return looking(3 * np.array([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)]) + [0, 0, 0.2], (0, 0, 0.45), field_of_view)
+    return looking(3 * np.array([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)]) + [0, 0, 0.2], (0, 0, 0.45), 45)
 
 
 def sky() -> Capture:
@@ -160,13 +161,10 @@ def lenses() -> Capture:
     """An object, every second view through a lens of six times the focal length."""
     builder = Builder(3)
     _object(builder)
-    views = [_around(i, 48) if i % 2 else _longer(_around(i, 48), 6) for i in range(48)]
-    held_out = [_around(i + 0.43, 8) if i % 2 else _longer(_around(i + 0.43, 8), 6) for i in range(8)]
+    views, held_out = [_around(i, 48) for i in range(48)], [_around(i + 0.43, 8) for i in range(8)]
+    for some in (views, held_out):
+        some[::2] = [replace(view, fx=6 * view.fx, fy=6 * view.fy) for view in some[::2]]
     return Capture(builder.gaussians(), views, held_out)
-
-
-def _longer(view: Camera, factor: float) -> Camera:
-    return replace(view, fx=factor * view.fx, fy=factor * view.fy)
 
 
 def _room(builder: Builder, corner: ArrayLike, count: int) -> None:

@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import torch
-from torch import Tensor
-from workloads import Workload, activated, effects_of
+from workloads import Passes, Workload, effects_of
 
 from mipmap_plugin import register_backend
 from mipmap_plugin.backends import get_backend
@@ -63,25 +62,10 @@ class Scaling:
     machine_ratio: Spread  # twice one over both processes: what two processors gave just then
 
 
-class Job:
-    """What is timed."""
-
-    def __init__(self, backend: str, file: Path) -> None:
-        self._backend, self._work = get_backend(backend), Workload.load(file)
-        self._leaves = {name: tensor.requires_grad_() for name, tensor in self._work.raw.items()}
-
-    def forward(self) -> None:
-        with torch.no_grad():
-            self._image()
-
-    def forward_backward(self) -> None:
-        for leaf in self._leaves.values():
-            leaf.grad = None
-        (self._image() * self._work.weights).sum().backward()
-
-    def _image(self) -> Tensor:
-        gaussians = activated(self._leaves)
-        return self._backend.render(gaussians, self._work.camera, effects_of(gaussians)).image
+def job_of(backend: str, file: Path) -> Passes:
+    render, work = get_backend(backend).render, Workload.load(file)
+    raw = {name: tensor.requires_grad_() for name, tensor in work.raw.items()}
+    return Passes(raw, work.weights, lambda gaussians: render(gaussians, work.camera, effects_of(gaussians)).image)
 
 
 def fresh(function: Callable[..., Result], *arguments: object) -> Result:
@@ -93,8 +77,8 @@ def fresh(function: Callable[..., Result], *arguments: object) -> Result:
 def measure_speed(backend: str, file: Path, warm_up: Path, runs: int) -> Speed:
     """`warm_up`: a tiny workload on which imports and compilation are done, so that neither is in the figures."""
     torch.set_num_threads(1)
-    Job(backend, warm_up).forward_backward()
-    job = Job(backend, file)
+    job_of(backend, warm_up).forward_backward()
+    job = job_of(backend, file)
     before = _peak_mib()
     job.forward_backward()
     extra = round(_peak_mib() - before, 1)
@@ -104,7 +88,7 @@ def measure_speed(backend: str, file: Path, warm_up: Path, runs: int) -> Speed:
 
 
 def measure_scaling(backend: str, file: Path, runs: int) -> Scaling:
-    job = Job(backend, file)
+    job = job_of(backend, file)
     near, far = get_context("spawn").Pipe()
     neighbor = get_context("spawn").Process(target=_neighbor, args=(backend, file, far), daemon=True)
     neighbor.start()
@@ -128,7 +112,7 @@ def measure_scaling(backend: str, file: Path, runs: int) -> Scaling:
 def _neighbor(backend: str, file: Path, far: Connection) -> None:
     """Does the same on one thread, once per request."""
     torch.set_num_threads(1)
-    job = Job(backend, file)
+    job = job_of(backend, file)
     while far.recv():
         job.forward_backward()
         far.send("done")

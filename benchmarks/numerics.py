@@ -21,6 +21,7 @@ from mipmap_plugin.backends.conformance.cases import HardCase, crowd, far_from_t
 from mipmap_plugin.backends.conformance.checks import Answer, draw
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.evaluation.tradeoff.plot import figure_class
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.splatting.filters import LEAST_COMPENSATION, footprint
@@ -201,12 +202,8 @@ def markdown(header: Row, rows: Iterable[Row]) -> str:
 
 
 def plot(measured: dict[str, dict[float, dict[str, tuple[float, float]]]], path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(2, len(measured), figsize=(16, 7), sharey="row")
+    figure = figure_class()(figsize=(16, 7))
+    axes = figure.subplots(2, len(measured), sharey="row")
     for column, (sweep, by_value) in enumerate(measured.items()):
         for row, what in enumerate(("image", "gradients")):
             axis = axes[row][column]

@@ -9,7 +9,6 @@ recipes that are not measured again are kept.
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from collections.abc import Sequence
@@ -17,12 +16,11 @@ from pathlib import Path
 
 import torch
 import tyro
-from pages import write_page
+from bases import photographs_of
+from rows import earlier, write_page, write_rows
 
-from mipmap_plugin import load_scene, wrap_model
+from mipmap_plugin import wrap_model
 from mipmap_plugin.evaluation.evaluate import Row, all_rows, evaluator_of
-from mipmap_plugin.evaluation.report import records, table
-from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.recipes import RECIPES as KNOWN
 
 # The scales that each base was trained for the study of; see its own page. Those of lego at 400 px are of `gpu_bases.py`.
@@ -63,11 +61,10 @@ def main(
     for base in bases_of(data, only):
         recipes = recipe or (RECIPES if max(SCALES[base]) > 1 else (*RECIPES, "thorough"))
         wrapped = wrap_model(data / "checkpoints" / "bases" / base, backend=backend)
-        scene = load_scene(data / "images" / base.split("_")[0])
-        rows = kept(output / f"{base}.json", recipes) + all_rows(wrapped, evaluator_of(wrapped, scene, "P3"), SCALES[base], recipes)
+        judge = evaluator_of(wrapped, photographs_of(data, base), "P3")
+        rows = kept(output / f"{base}.json", recipes) + all_rows(wrapped, judge, SCALES[base], recipes)
         rows.sort(key=lambda row: (abs(math.log2(row.scale)), recipe_of(row) is not None))
-        write_json(output / f"{base}.json", records(rows), overwrite=True)
-        print(f"{base}\n{table(rows)}\n", flush=True)
+        write_rows(output / f"{base}.json", rows)
     write_page(output / "real_bases.md", INTRO, output.glob("*_[0-9]*.json"))
 
 
@@ -82,8 +79,7 @@ def bases_of(data: Path, only: Sequence[str]) -> Sequence[str]:
 
 def kept(file: Path, measured: Sequence[str]) -> list[Row]:
     """The rows of an earlier run that are not measured again."""
-    rows = [Row(**row) for row in json.loads(file.read_text())] if file.exists() else []
-    return [row for row in rows if recipe_of(row) not in (None, *measured)]
+    return [row for row in earlier(file, Row) if recipe_of(row) not in (None, *measured)]
 
 
 def recipe_of(row: Row) -> str | None:

@@ -25,6 +25,7 @@ from typing import Any
 
 import torch
 import tyro
+from rows import joined
 from workloads import split_into
 
 from mipmap_plugin.camera import Camera
@@ -189,11 +190,9 @@ def lines(row: dict[str, Any]) -> list[str]:
 def keep(rows: list[dict[str, Any]], output: Path, photographs: int, threads: int) -> None:
     """Write the tables: these rows, and those of earlier runs that they do not replace."""
     file = output / "size.json"
-    earlier = json.loads(file.read_text()) if file.exists() else []
-    key = lambda row: (row["splats"], row["command"], row["version"])  # noqa: E731
-    new = {key(row) for row in rows}
+    everything = joined(file, dict, rows, lambda row: (row["splats"], row["command"], row["version"]))
     order = lambda row: (row["splats"], COMMANDS.index(row["command"].split(",")[0]), row["command"], row["version"] != "before")  # noqa: E731
-    everything = sorted([*(row for row in earlier if key(row) not in new), *rows], key=order)
+    everything.sort(key=order)
     write_json(file, everything, overwrite=True)
     intro = INTRO.format(photographs=photographs, machine=f"{threads} threads.")
     (output / "size.md").write_text("\n".join([intro, HEAD, *(line for row in everything for line in lines(row)), ""]))

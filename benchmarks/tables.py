@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
-from measure import YARDSTICK, Scaling, Speed, Spread, Timing
+from measure import YARDSTICK, Scaling, Speed, Spread
 from workloads import Size
 
 from mipmap_plugin.evaluation.report import markdown
@@ -39,14 +40,14 @@ class Rows:
     def ratio(self, row: Row, yardstick: str) -> tuple[float, float] | None:
         """How many times less CPU time than `yardstick` on the same workload: forward, forward and backward. None: not measured."""
         other = self._by_key.get((yardstick, row.size.name))
-        return None if other is None else (_times(other, row, _forward), _times(other, row, _both))
+        return None if other is None else (_times(other, row, "forward"), _times(other, row, "forward_backward"))
 
     def growth(self, backend: str, what: str) -> dict[str, float] | None:
         """What ten times as many splats or pixels cost, as factors; None: not measured."""
         few, many = (self._by_key.get((backend, name)) for name in GROWTH[what])
         if few is None or many is None:
             return None
-        factors = {"forward": _times(many, few, _forward), "forward_backward": _times(many, few, _both)}
+        factors = {of: _times(many, few, of) for of in ("forward", "forward_backward")}
         memory = many.speed.extra_mib / max(few.speed.extra_mib, 1.0)  # below 1 MiB lies the noise
         return factors | {"extra_memory": round(memory, 2), "pairs": round(many.size.pairs / few.size.pairs, 2)}
 
@@ -96,13 +97,6 @@ def _ratio(factors: tuple[float, float] | None) -> str:
     return "-" if factors is None else " / ".join(f"{factor:.1f}" for factor in factors)
 
 
-def _times(dividend: Row, divisor: Row, of: Callable[[Row], Timing]) -> float:
-    return round(of(dividend).cpu_ms.median / of(divisor).cpu_ms.median, 2)
-
-
-def _forward(row: Row) -> Timing:
-    return row.speed.forward
-
-
-def _both(row: Row) -> Timing:
-    return row.speed.forward_backward
+def _times(dividend: Row, divisor: Row, of: Literal["forward", "forward_backward"]) -> float:
+    most, least = (getattr(row.speed, of).cpu_ms.median for row in (dividend, divisor))
+    return round(most / least, 2)

@@ -12,15 +12,13 @@ from pathlib import Path
 
 import torch
 import tyro
-from pages import write_page
+from bases import judge_of
 from real_bases import SCALES, bases_of
+from rows import write_page, write_rows
 
-from mipmap_plugin import load_scene, wrap_model
+from mipmap_plugin import wrap_model
 from mipmap_plugin.evaluation.evaluate import Evaluator, Row, adapted_row
 from mipmap_plugin.evaluation.measure import adapt_alone
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
-from mipmap_plugin.evaluation.report import records, table
-from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.wrap import Wrapped
 
 # Parts of `paper`'s seconds that `default` gets.
@@ -61,11 +59,9 @@ def main(
     torch.set_num_threads(1)
     for base in bases_of(data, only):
         model = wrap_model(data / "checkpoints" / "bases" / base)
-        judged = test_views(load_scene(data / "images" / base.split("_")[0]), model.cameras, model.background)[:views]
-        judge = Evaluator(judged, PROTOCOLS["P3"], None, base)
+        judge = judge_of(model, data, base, views)
         rows = [row for scale in SCALES[base] if scale != 1 for row in rows_of(model, judge, scale)]
-        write_json(output / "tenth" / f"{base}.json", records(rows), overwrite=True)
-        print(f"{base}\n{table(rows)}\n", flush=True)
+        write_rows(output / "tenth" / f"{base}.json", rows)
     write_page(output / "tenth.md", INTRO, output.glob("tenth/*.json"))
 
 

@@ -25,7 +25,7 @@ from typing import Any
 import torch
 import tyro
 
-from mipmap_plugin import wrap_model
+from mipmap_plugin import load_scene, wrap_model
 from mipmap_plugin.adaptation.adapted import render_model
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.evaluation.metrics import psnr
@@ -93,7 +93,7 @@ def run(
         for each, options in RUNS.items():
             own = ["--tiles", str(tiles), *options] if each == "tiled" else options
             row[each] = measured(["adapt", str(scene), "--scale", scale, "--output", str(files[each]), *own, *further])
-        base = wrap_model(scene, cameras=load_cameras(cameras), backend="cpu")
+        base = wrap_model(scene, cameras=None if cameras is None else load_scene(cameras), backend="cpu")
         row["splats"] = len(base.model.parameters()["means"])
         row |= compared(base, files, float(Fraction(scale)))
     file = RESULTS / "tiles.json"
@@ -101,13 +101,6 @@ def run(
     rows = [other for other in rows if (other["scene"], other["tiles"], other["steps"]) != (row["scene"], tiles, steps)] + [row]
     write_json(file, rows, overwrite=True)
     (RESULTS / "tiles.md").write_text(page(rows), encoding="utf-8")
-
-
-def load_cameras(cameras: Path | None) -> Any:
-    """The scene that holds the cameras, if they are not beside the base."""
-    from mipmap_plugin import load_scene
-
-    return None if cameras is None else load_scene(cameras)
 
 
 COLUMNS = ("scene", "splats", "tiles", "tiled = untiled, dB", "two seeds, dB", "untiled, dB", "tiled, dB", "peak MiB", "CPU s")

@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 import tyro
-from pages import write_page
+from rows import write_page, write_rows
 from torch import Tensor
 
 from mipmap_plugin import Camera, wrap_model
@@ -31,9 +31,8 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.evaluation.evaluate import Evaluator, Row, adapted_row
 from mipmap_plugin.evaluation.measure import RESIZED, RenderView, adapt_alone, baselines, resized_base, views_seen, warm_up
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TestView
-from mipmap_plugin.evaluation.report import records, table
+from mipmap_plugin.evaluation.report import table
 from mipmap_plugin.evaluation.tradeoff.truth import EVALUATION_SEED
-from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.images import read_image
 from mipmap_plugin.wrap import Wrapped
 
@@ -123,10 +122,10 @@ def judges(base: Wrapped, capture: Capture, name: str, scale: float, cameras: Se
 
 def free_rows(base: Wrapped, judge: Evaluator, scale: float) -> list[Row]:
     """Everything that needs no adapting, but what is the truth itself."""
-    finest, count = math.ceil(1 / scale), len(base.model.gaussians(base.any_camera()))
+    finest = math.ceil(1 / scale)
     found = baselines(base, scale, judge.protocol.shrink_by, filters=("scaled", "window"), samples=sorted({2, finest}) if scale < 1 else ())
     truth = {AVERAGED: (RESIZED, f"supersampling, {finest} x {finest}"), BICUBIC: (RESIZED,)}.get(judge.protocol, ())
-    return [judge.row(baseline.name, scale, baseline.render, gaussians=count) for baseline in found if baseline.name not in truth]
+    return [judge.row(baseline.name, scale, baseline.render, gaussians=baseline.gaussians) for baseline in found if baseline.name not in truth]
 
 
 def recipes(capture: Capture, scale: float) -> dict[str, dict[str, Any]]:
@@ -180,8 +179,7 @@ def main(
     for name in only or CAPTURES:
         for each in scale or CAPTURES[name].scales:
             rows = rows_of(name, each, data, views)
-            write_json(output / "unbounded" / f"{name}_x{each:g}.json", records(rows), overwrite=True)
-            print(f"{name}\n{table(rows)}\n", flush=True)
+            write_rows(output / "unbounded" / f"{name}_x{each:g}.json", rows)
     write_page(output / "unbounded.md", INTRO, output.glob("unbounded/*.json"))
 
 

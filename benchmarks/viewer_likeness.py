@@ -20,6 +20,7 @@ import torch
 import tyro
 
 from mipmap_plugin import Camera, wrap_model
+from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.report import markdown
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.wrap import Wrapped
@@ -72,7 +73,7 @@ def likeness(browser: Browser, viewer: str, checkpoint: Path, scene: str) -> lis
     if viewer == VISER:  # whose pixels are square
         cameras = [replace(camera, fx=camera.fy) for camera in cameras]
     ours = [render(model, camera, viewer) for camera in cameras]
-    return [psnr(image, picture) for image, picture in zip(ours, pictures(browser, viewer, model, cameras), strict=True)]
+    return [psnr(image, torch.from_numpy(picture)) for image, picture in zip(ours, pictures(browser, viewer, model, cameras), strict=True)]
 
 
 def pictures(browser: Browser, viewer: str, model: Wrapped, cameras: Sequence[Camera]) -> list[np.ndarray]:
@@ -83,14 +84,10 @@ def pictures(browser: Browser, viewer: str, model: Wrapped, cameras: Sequence[Ca
         return [drawn(*shown, camera, model.background) for camera in cameras]
 
 
-def render(model: Wrapped, camera: Camera, viewer: str) -> np.ndarray:
+@torch.no_grad()
+def render(model: Wrapped, camera: Camera, viewer: str) -> torch.Tensor:
     """Our picture, in 8 bits."""
-    with torch.no_grad():
-        return model.render(camera, viewer=viewer).image.clamp(0, 1).mul(255).round().div(255).numpy()
-
-
-def psnr(image: np.ndarray, other: np.ndarray) -> float:
-    return float(-10 * np.log10(max(np.square(image - other).mean(), 1e-12)))
+    return model.render(camera, viewer=viewer).image.clamp(0, 1).mul(255).round().div(255)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ viewers.md and viewers.png from all in that folder. Files and viewers that are n
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 import tempfile
@@ -21,9 +20,11 @@ from statistics import fmean
 import numpy as np
 import torch
 import tyro
+from bases import photographs_of
 from PIL import Image, ImageDraw
+from rows import earlier, joined
 
-from mipmap_plugin import load_scene, wrap_model
+from mipmap_plugin import wrap_model
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, TestView, photographed_views
 from mipmap_plugin.evaluation.report import markdown
@@ -83,23 +84,6 @@ class Work:
         return next(saved.rglob("*.ply"))
 
 
-def as_it_is(work: Work, viewer: str) -> Path | None:
-    return work.base.model.source
-
-
-def for_classic(work: Work, viewer: str) -> Path | None:
-    """None at x1, where the base is that file."""
-    return None if work.scale == 1 else work.adapted("classic")
-
-
-def for_viewer(work: Work, viewer: str) -> Path | None:
-    return work.adapted(viewer, viewer=viewer)
-
-
-def for_all(work: Work, viewer: str) -> Path | None:
-    return work.adapted("portable", viewer="portable")
-
-
 def decimated(how: str) -> Callable[[Work, str], Path | None]:
     """A rival's file with as many splats as the one for the viewer; none at x1, where those are about as many as the base's."""
 
@@ -115,10 +99,10 @@ def decimated(how: str) -> Callable[[Work, str], Path | None]:
 
 
 FILES: dict[str, Callable[[Work, str], Path | None]] = {
-    "base": as_it_is,
-    "classic": for_classic,
-    "viewer": for_viewer,
-    "portable": for_all,
+    "base": lambda work, viewer: work.base.model.source,
+    "classic": lambda work, viewer: None if work.scale == 1 else work.adapted("classic"),  # at x1 the base is that file
+    "viewer": lambda work, viewer: work.adapted(viewer, viewer=viewer),
+    "portable": lambda work, viewer: work.adapted("portable", viewer="portable"),
     "splat-transform": decimated("decimate"),
     "splat-transform-adaptive": decimated("decimate-adaptive"),
 }
@@ -148,13 +132,13 @@ def main(
     pictures.mkdir(parents=True, exist_ok=True)
     for base in only or BASES:
         wrapped = wrap_model(data / "checkpoints" / "bases" / base)
-        views = photographed_views(wrapped, load_scene(data / "images" / base.split("_")[0]))[VIEWS]
+        views = photographed_views(wrapped, wrapped.place(photographs_of(data, base)))[VIEWS]
         for at in scale or SCALES:
             with tempfile.TemporaryDirectory() as folder, Browser() as browser:
                 work = Work(wrapped, at, Path(folder))
                 rows = [row for name in viewer or VIEWERS for row in rows_of_viewer(browser, work, base, name, files, views, pictures)]
             keep(pictures / f"{base}.json", rows)
-    measured = [Row(**row) for file in sorted(pictures.glob("*.json"), reverse=True) for row in json.loads(file.read_text())]
+    measured = [row for file in sorted(pictures.glob("*.json"), reverse=True) for row in earlier(file, Row)]
     (output / "viewers.md").write_text(page(measured))
     if drawn := mosaic(pictures):
         drawn.save(output / "viewers.png")
@@ -193,10 +177,9 @@ def count_of(ply: Path) -> int:
 
 def keep(file: Path, rows: Sequence[Row]) -> None:
     """Write the rows, beside those of an earlier run that were not measured again."""
-    before = [Row(**row) for row in json.loads(file.read_text())] if file.exists() else []
-    latest = {(row.scale, row.viewer, row.file): row for row in (*before, *rows)}
+    latest = joined(file, Row, rows, lambda row: (row.scale, row.viewer, row.file))
     ranks = {name: rank for rank, name in enumerate((*VIEWERS, *FILES))}
-    ordered = sorted(latest.values(), key=lambda row: (-row.scale, ranks[row.viewer], ranks[row.file]))
+    ordered = sorted(latest, key=lambda row: (-row.scale, ranks[row.viewer], ranks[row.file]))
     write_json(file, [asdict(row) for row in ordered], overwrite=True)
 
 

@@ -24,7 +24,6 @@ import tyro
 from mipmap_plugin.formats.atomic import write_json
 
 HERE = Path(__file__).parents[1]
-COMMAND = "import sys; from mipmap_plugin.cli import main; sys.exit(main())"
 PHASES = ("compilation", "blend weights", "merging", "closed form", "pseudo truth", "optimization", "validation")
 INTRO = """# How long a person waits
 
@@ -88,7 +87,7 @@ def timed(checkout: Path, options: list[str], threads: int, *, cold: bool) -> di
         environment |= {"PYTHONDONTWRITEBYTECODE": ""}  # else whatever changed since the installation is compiled by every process
         environment |= {"NUMBA_CACHE_DIR": folder} if cold else {}
         output = ["--output", str(Path(folder, "adapted"))] if options[0] == "adapt" else []
-        command = [sys.executable, "-c", COMMAND, *options, *output]
+        command = [sys.executable, "-m", "mipmap_plugin", *options, *output]
         began = time.perf_counter()
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment, cwd=folder) as process:
             assert process.stdout is not None

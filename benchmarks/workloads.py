@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -40,6 +41,24 @@ class Workload:
     def load(cls, path: Path) -> Workload:
         facts = torch.load(path, weights_only=True)
         return cls(**facts | {"camera": Camera(**facts["camera"])})
+
+
+@dataclass(frozen=True, eq=False)
+class Passes:
+    """What is timed: from `raw` to an image, and back from sum(image * weights)."""
+
+    raw: dict[str, Tensor]  # that require gradients
+    weights: Tensor  # [H, W, 3]
+    render: Callable[[Gaussians], Tensor]
+
+    def forward(self) -> None:
+        with torch.no_grad():
+            self.render(activated(self.raw))
+
+    def forward_backward(self) -> None:
+        for leaf in self.raw.values():
+            leaf.grad = None
+        (self.render(activated(self.raw)) * self.weights).sum().backward()
 
 
 @dataclass(frozen=True)
@@ -128,12 +147,15 @@ def split_into(gaussians: Gaussians, count: int) -> Gaussians:
 def of_gaussians(name: str, gaussians: Gaussians, camera: Camera) -> Workload:
     if gaussians.covariances is not None:
         raise SettingsError(f"{name}: its family gives covariances, which have no raw parameters to measure from; take another checkpoint")
-    raw = {
-        "means": gaussians.means, "log_scales": gaussians.scales.log(), "quats": gaussians.quats,
-        "logits": gaussians.opacities.logit(eps=1e-6), "sh": gaussians.sh,
-    }  # fmt: skip
+    raw = raw_of(gaussians)
     weights = torch.randn(*camera.size, 3, generator=torch.Generator().manual_seed(0))
     return Workload(name, raw, camera, weights, count_pairs(activated(raw), camera))
+
+
+def raw_of(gaussians: Gaussians) -> dict[str, Tensor]:
+    """The raw parameters of splats, of which `activated` makes them."""
+    g = gaussians
+    return {"means": g.means, "log_scales": g.scales.log(), "quats": g.quats, "logits": g.opacities.logit(eps=1e-6), "sh": g.sh}
 
 
 def activated(raw: dict[str, Tensor]) -> Gaussians:

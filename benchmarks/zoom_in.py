@@ -10,22 +10,19 @@ from all of them.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Literal
 
 import torch
 import tyro
-from pages import write_page
+from bases import judge_of
+from rows import earlier, write_page, write_rows
 from zoom_in_plot import draw
 
-from mipmap_plugin import load_scene, wrap_model
+from mipmap_plugin import wrap_model
 from mipmap_plugin.evaluation.evaluate import Evaluator, Row, adapted_row
-from mipmap_plugin.evaluation.measure import BASE, adapt_alone, resized_base, warm_up
+from mipmap_plugin.evaluation.measure import BASE, adapt_alone, resized_base, splats_shown, warm_up
 from mipmap_plugin.evaluation.perceptual import Perceptual
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
-from mipmap_plugin.evaluation.report import records, table
-from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.wrap import Wrapped
 
 INTRO = """# Zoom-in: dB against LPIPS
@@ -57,7 +54,7 @@ def rows_of(model: Wrapped, judge: Evaluator, scale: float) -> list[Row]:
     """The base as it is, its own image enlarged, and with each crispness the closed form and the recipe without a network."""
     warm_up(model, scale, model.cameras)
     base = lambda camera: model.render(camera.zoomed(scale), scale).image  # noqa: E731
-    rows = [judge.row(BASE, scale, base, gaussians=_count(model)), enlarged(model, judge, scale, "bicubic")]
+    rows = [judge.row(BASE, scale, base, gaussians=splats_shown(model)), enlarged(model, judge, scale, "bicubic")]
     for each in CRISPNESS:
         instant = adapt_alone(model, scale, recipe="instant", views="train", crispness=each)
         rows.append(adapted_row(f"closed form, crispness {each:g}", instant, judge))
@@ -79,17 +76,12 @@ def network_rows(model: Wrapped, judge: Evaluator, scale: float, networks: list[
 def enlarged(model: Wrapped, judge: Evaluator, scale: float, by: str) -> Row:
     """The base's own image, made larger."""
     show = lambda camera: resized_base(model.render(camera).image, camera.zoomed(scale).size, shrink_by=judge.protocol.shrink_by, upsampler=by)  # noqa: E731
-    return judge.row(f"enlarged by {Path(by).name}", scale, show, gaussians=_count(model))
+    return judge.row(f"enlarged by {Path(by).name}", scale, show, gaussians=splats_shown(model))
 
 
 def kept(file: Path, scale: float) -> list[Row]:
     """The rows with networks of an earlier run."""
-    rows = [Row(**row) for row in json.loads(file.read_text())] if file.exists() else []
-    return [row for row in rows if row.scale == scale and any(name in row.name for name in NETWORKS[int(scale)])]
-
-
-def _count(model: Wrapped) -> int:
-    return len(model.model.gaussians(model.any_camera()))
+    return [row for row in earlier(file, Row) if row.scale == scale and any(name in row.name for name in NETWORKS[int(scale)])]
 
 
 def main(
@@ -116,18 +108,16 @@ def main(
     perceptual = Perceptual("alex", data / "lpips" / "alexnet_features_fp16.pth")
     for base in only or ("lego_100", "chair_100"):
         model = wrap_model(data / "checkpoints" / "bases" / base)
-        judged = test_views(load_scene(data / "images" / base.split("_")[0]), model.cameras, model.background)[:views]
-        judge = Evaluator(judged, PROTOCOLS["P3"], perceptual, base)
+        judge = judge_of(model, data, base, views, perceptual)
         file, rows = output / "zoom_in" / f"{base}.json", []
         for each in scale or (2, 4):
             rows += rows_of(model, judge, each)
             files = [data / "upsamplers" / name for name in NETWORKS[each]]
             rows += network_rows(model, judge, each, files, steps) if networks else kept(file, each)
-        write_json(file, records(rows), overwrite=True)
-        print(f"{table(rows)}\n", flush=True)
+        write_rows(file, rows)
     measured = sorted(output.glob("zoom_in/*.json"))
     write_page(output / "zoom_in.md", INTRO, measured)
-    draw(output / "zoom_in.png", {file.stem: [Row(**row) for row in json.loads(file.read_text())] for file in measured})
+    draw(output / "zoom_in.png", {file.stem: earlier(file, Row) for file in measured})
 
 
 if __name__ == "__main__":

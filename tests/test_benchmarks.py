@@ -19,7 +19,7 @@ import unbounded  # noqa: E402
 from ablations import ABLATIONS  # noqa: E402
 from backends import facts, joined  # noqa: E402
 from measure import Scaling, Speed, Spread, Timing  # noqa: E402
-from pages import write_page  # noqa: E402
+from rows import write_page  # noqa: E402
 from scenes import make  # noqa: E402
 from tables import Row, Rows  # noqa: E402
 from workloads import Size, Variant, activated, count_pairs, effects_of, from_scene, from_variant, split_into  # noqa: E402

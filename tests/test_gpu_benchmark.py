@@ -33,7 +33,7 @@ from gpu_results import Results, report  # noqa: E402
 from gpu_speed import Scene, denser  # noqa: E402
 from gpu_tables import speed_table  # noqa: E402
 from gpu_timing import Clock, copied_per_second  # noqa: E402
-from gpu_views import Shots, measure, raw_of  # noqa: E402
+from gpu_views import Shots, measure  # noqa: E402
 
 from mipmap_plugin import load_model  # noqa: E402
 from mipmap_plugin.backends.conformance import Outcome  # noqa: E402
@@ -98,7 +98,7 @@ def test_millions_of_splats_are_made_from_fewer_on_the_same_surfaces(monkeypatch
 
 
 def test_small_views_are_timed_alone_and_together():
-    shots = Shots(raw_of(tiny.gaussians(), "cpu"), tiny.cameras(2))
+    shots = Shots.of(tiny.gaussians(), tiny.cameras(2))
     alone, both = measure("reference", shots, "cpu", 1), measure("cpu", shots, "cpu", 1)
     assert (alone.width, alone.views, alone.together_ms) == (32, 2, None) and alone.alone_ms > 0
     assert both.together_ms > 0 and alone.step_ms > 0 and both.step_ms > 0

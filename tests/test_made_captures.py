@@ -8,8 +8,9 @@ import pytest
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))  # its modules import one another by bare names, as scripts do
 
-from captures import Row, joined, main
+from captures import Row, main
 from made_captures import CAPTURES
+from rows import joined
 
 from mipmap_plugin.adaptation.shown import showing
 from mipmap_plugin.evaluation.measure import views_seen
@@ -29,6 +30,6 @@ def test_what_few_views_show_is_adapted_too(tmp_path):
     (row,) = json.loads((tmp_path / "captures.json").read_text())
     assert row["psnrs_db"]["default"] > row["psnrs_db"]["base"] + 8 and row["least_change_db"] > 5
     write_json(tmp_path / "captures.json", [row | {"seed": 7}, row | {"psnrs_db": {}}], overwrite=True)
-    kept = joined(tmp_path / "captures.json", [Row(**row)])
-    assert [each.seed for each in kept] == [0, 7] and kept[0].psnrs_db == row["psnrs_db"]
+    kept = joined(tmp_path / "captures.json", Row, [Row(**row)], lambda each: each.seed)
+    assert [each.seed for each in kept] == [7, 0] and kept[1].psnrs_db == row["psnrs_db"]
     assert "| board   | x0.25 | 0    |" in (tmp_path / "captures.md").read_text()

@@ -70,7 +70,7 @@ def _inside(views: Sequence[Camera], means: Tensor, near: float) -> Iterator[Ten
 
 
 @announced("examining views")
-def refuse_blind(views: Sequence[Camera], model: SplatModel, near: float, image_of: Callable[[Camera], Tensor], scale: float = 1.0) -> None:
+def refuse_blind(views: Sequence[Camera], model: SplatModel, near: float, image_of: Callable[[Camera], Tensor], scale: float) -> None:
     """Raise SettingsError if the views show nothing, or a speck: the cameras may be of another scene, or no renderer draws the splats, for example.
 
     `near`: the near plane, in world units; `image_of`: a view's image [h, w, 3]; `scale`: the one adapted to, since a zoom-in makes specks large.

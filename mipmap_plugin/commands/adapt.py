@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,12 +25,12 @@ from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.recipes import recipe as make_config
 
 if TYPE_CHECKING:
-    from mipmap_plugin.adaptation.adapted import Adapted
     from mipmap_plugin.adaptation.report import Report
     from mipmap_plugin.models.base import SplatModel
     from mipmap_plugin.wrap import Wrapped
 
 File = tuple[float, str | None, Path]  # its scale, the viewer that it is for, and where it is written
+Facts = dict[str, Any]  # a report as JSON, with the path of its file
 
 
 @dataclass(frozen=True)
@@ -103,8 +103,8 @@ def adapt(
     left = [file for file in files if file[2] not in before]
     _check(wrapped, left, settings, overwrite)
     page = AdaptationPage(checkpoint, [target for *_, target in files], overwrite) if report else None
-    models = _adapted(wrapped, left, settings | dict(images=images and scene(replace(base, checkpoint=checkpoint), images)))
-    made = _save_all(wrapped, models, page, overwrite, quiet=json)
+    photographs = images and scene(replace(base, checkpoint=checkpoint), images)
+    made = _made(wrapped, left, settings | dict(images=photographs), page, overwrite, json)
     if page:
         page.write(made, [*before.values()])
     if json:
@@ -133,7 +133,7 @@ def _files(checkpoint: Path, output: Path | None, requests: Sequence[tuple[float
     return files
 
 
-def _finished(jobs: Sequence[Job], files: Sequence[File], json: bool) -> dict[Path, dict[str, Any]]:
+def _finished(jobs: Sequence[Job], files: Sequence[File], json: bool) -> dict[Path, Facts]:
     """The reports of files that an interrupted command has written; none of a single file, which is made or refused. `jobs`: what would make each."""
     if len(files) == 1 or jobs[0].overwrite:
         return {}
@@ -149,36 +149,23 @@ def _check(wrapped: Wrapped, files: Sequence[File], settings: dict[str, Any], ov
         wrapped.refuse_output(target, overwrite=overwrite, networks_move=config.steps > 0 and config.rates.networks > 0, viewer=viewer)
 
 
-def _adapted(wrapped: Wrapped, files: Sequence[File], settings: dict[str, Any]) -> Iterator[tuple[Adapted, Path]]:
-    """Yield each model as soon as it is adapted, and the path to save it to."""
+def _made(base: Wrapped, files: Sequence[File], settings: dict[str, Any], page: AdaptationPage | None, overwrite: bool, quiet: bool) -> list[Facts]:
+    """Adapt to each scale and viewer, save the file, draw it for the page, and print a summary unless `quiet`; return all reports."""
     from mipmap_plugin.models.places import state_path
 
-    wrapped.keeps_images = len(files) > 1
+    base.keeps_images, reports = len(files) > 1, list[Facts]()
     for scale, viewer, target in files:
-        yield wrapped.adapt(scale, viewer=viewer, resume=state_path(target), **settings), target
-
-
-def _save_all(
-    base: Wrapped, models: Iterable[tuple[Adapted, Path]], page: AdaptationPage | None, overwrite: bool, *, quiet: bool
-) -> list[dict[str, Any]]:
-    """Save each model as soon as it is adapted, draw it for the page, and print a summary unless `quiet`; return all reports."""
-    reports = []
-    for adapted, target in models:
-        reports.append(_saved(adapted, target, overwrite, quiet=quiet))
+        adapted = base.adapt(scale, viewer=viewer, resume=state_path(target), **settings)
+        saved = adapted.save(target, overwrite=overwrite)
+        report = adapted.report_of(saved)
+        reports.append({"file": str(saved.absolute()), **report.model_dump()})
         if not quiet:
+            _say(saved, report, adapted.model)
             show_before_and_after(base, adapted)
         if page:
-            page.add(base, adapted.as_written(Path(reports[-1]["file"])))
+            page.add(base, adapted.as_written(saved))
         del adapted  # before the next is made: its splats, and the truths that its file was measured by, take memory
     return reports
-
-
-def _saved(adapted: Adapted, target: Path, overwrite: bool, *, quiet: bool) -> dict[str, Any]:
-    """Save an adapted model, print a summary unless `quiet`, and return its report."""
-    saved = adapted.save(target, overwrite=overwrite)
-    if not quiet:
-        _say(saved, adapted.report_of(saved), adapted.model)
-    return {"file": str(saved.absolute()), **adapted.report_of(saved).model_dump()}
 
 
 def _requests(scales: Sequence[float], viewers: tuple[str, ...]) -> list[tuple[float, str | None]]:

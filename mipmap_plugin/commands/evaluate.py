@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from mipmap_plugin.commands.common import print_json, scene, without_none, wrap
-from mipmap_plugin.commands.pages import evaluation_gallery, evaluation_page_path, look_at, write_evaluation_page
+from mipmap_plugin.commands.pages import evaluation_page_path, look_at, write_evaluation_page
 from mipmap_plugin.commands.resuming import resumable, resume_path
 from mipmap_plugin.commands.types import BackendName, Background, Scales, ScreenFilter, Seed, Threads, Viewer, unique_scales
 from mipmap_plugin.commands.voice import say
@@ -77,7 +77,7 @@ def evaluate(
     _refuse(checkpoint, images, cameras, [path for path in (output, page) if path], overwrite)
     settings = without_none(seed=seed, steps=steps, upsampler=upsampler, resize=resize, viewer=viewer)
     results = _Results(protocol, _perceptual(lpips, lpips_weights), unique_scales(scale), page, output)
-    with results.resumable():
+    with resumable(results.kept, "row"):
         for name, path, folder, own in zip(_names(checkpoint, images), checkpoint, images, cameras or [None] * len(checkpoint), strict=True):
             base = Base(path, own, background, backend, screen_filter)
             wrapped, photographs = wrap(base, threads), _scene(base, folder, appearance)
@@ -92,28 +92,26 @@ class _Results:
     def __init__(self, protocol: str, perceptual: Perceptual | None, scales: list[float], page: Path | None, output: Path | None) -> None:
         self._protocol, self._perceptual, self._scales, self._page, self._output = protocol, perceptual, scales, page, output
         written = output or page
-        self._kept = resume_path(written) if written else None
+        self.kept = resume_path(written) if written else None  # where finished rows are
         self._rows, self._notes, self._galleries = list[Any](), dict[str, None](), list[Any]()  # notes each once, in their order
         self.judged = list[int]()  # the number of judged views of each checkpoint
         self._scenes = list[Path]()
-
-    def resumable(self) -> AbstractContextManager[None]:
-        """Inside, Ctrl-C says how to go on, and what an earlier command finished is told."""
-        return resumable(self._kept, "row")
 
     def measure(self, name: str, wrapped: Wrapped, scene: Scene, appearance: str, recipes: Sequence[str], settings: dict[str, Any]) -> None:
         """Add the rows and notes of one checkpoint, whose rows are called by a name."""
         from mipmap_plugin.evaluation import evaluate as evaluation
         from mipmap_plugin.evaluation.cells import Cells
         from mipmap_plugin.evaluation.notes import notes
+        from mipmap_plugin.pages.gallery import Gallery
 
         lpips = self._perceptual and self._perceptual.label
         asked = {"name": name, "protocol": self._protocol, "lpips": lpips, "appearance": appearance, "settings": settings}
         made_from = {"base": wrapped.model.digest, "asked": wrapped.asked, "trained": str(wrapped.trained), "scene": scene.digest()}
         machinery = {"page": self._page is not None, "backend": wrapped.backend()[0].name, "threads": wrapped.threads}
-        cells = Cells(self._kept, asked | made_from | machinery)
+        cells = Cells(self.kept, asked | made_from | machinery)
         judge = evaluation.evaluator_of(wrapped, scene, self._protocol, self._perceptual, cells=cells)
-        gallery = evaluation_gallery(wrapped, self._protocol, len(judge.views), recipes) if self._page else None
+        truth = f"photographs, protocol {self._protocol}, {plural(len(judge.views), 'view')}"
+        gallery = Gallery(wrapped, truth, recipes) if self._page else None
         judge = replace(judge, watcher=gallery, scene=name)
         self._rows += evaluation.all_rows(wrapped, judge, self._scales, recipes, **settings)
         self._notes |= dict.fromkeys(notes(wrapped, judge, self._scales, recipes, settings, appearance))
@@ -134,8 +132,8 @@ class _Results:
                 write_evaluation_page(self._page, checkpoints, self._galleries, self._rows, [*self._notes], overwrite)
             if self._output:
                 write_json(self._output, facts, overwrite)
-        if self._kept:
-            delete(self._kept)
+        if self.kept:
+            delete(self.kept)
         return facts
 
     def print_tables(self, title: str, dataset: Any) -> None:
@@ -180,8 +178,10 @@ def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], cameras: Sequenc
             raise SettingsError(f"{option}: give {how}; got {len(given)}, for {len(checkpoint)} of these")
     if len(set(outputs)) < len(outputs):
         raise SettingsError(f"{outputs[0]}: the page is written there; give the rows another name, such as {outputs[0].with_suffix('.json')}")
-    read = [part for path in checkpoint for part in _parts(path)] + [file for folder in images for file in folder.glob("transforms*.json")]
-    read += cameras
+    from mipmap_plugin.models.outputs import parts_of
+
+    read = [part for path in checkpoint for part in (parts_of(None, path) if path.is_dir() else [path])]
+    read += [*(file for folder in images for file in folder.glob("transforms*.json")), *cameras]
     for output in outputs:
         refuse_output(output, overwrite, read, is_file=True)
         refuse_unwritable(output)
@@ -191,12 +191,6 @@ def _title(checkpoint: Sequence[Path], images: Sequence[Path], protocol: str, ju
     """`judged`: the number of judged views of each checkpoint."""
     views = plural(judged[0], "view") if len(judged) == 1 else f"{_listed(judged)} views"
     return f"{_listed(checkpoint)}; truth: {protocol} from {_listed(images)}, real dB over {views}"
-
-
-def _parts(checkpoint: Path) -> list[Path]:
-    from mipmap_plugin.models.outputs import parts_of
-
-    return parts_of(None, checkpoint) if checkpoint.is_dir() else [checkpoint]
 
 
 def _listed(values: Sequence[Any]) -> str:

@@ -21,7 +21,6 @@ from mipmap_plugin.progress import announced
 if TYPE_CHECKING:
     from mipmap_plugin.levels.contents import Contents as ZoomContents
     from mipmap_plugin.levels.distance.manifest import Contents as DistanceContents
-    from mipmap_plugin.levels.finished import Ladder
     from mipmap_plugin.levels.request import LadderRequest
     from mipmap_plugin.wrap import Wrapped
 
@@ -51,24 +50,22 @@ class Exports:
 
     def write(self, ladder: Path, contents: ZoomContents | DistanceContents) -> list[Path]:
         """Write them into the folder of a ladder; return the files that viewers open, and the page at last."""
-        page = []
-        if self.title is not None:
-            with announced("drawing the page"):
-                page = [write_levels_page(ladder, contents, self.title)]
-        return self._for_viewers(ladder) + page
-
-    def _for_viewers(self, ladder: Path) -> list[Path]:
         from mipmap_plugin.levels.manifest import CANVAS
         from mipmap_plugin.levels.streamed import write_streamed
         from mipmap_plugin.levels.tiles import write_tiles
 
-        return ([write_streamed(ladder, self.canvas or CANVAS)] if self.streamed_sog else []) + ([write_tiles(ladder)] if self.tiles else [])
+        page = []
+        if self.title is not None:
+            with announced("drawing the page"):
+                page = [write_levels_page(ladder, contents, self.title)]
+        streamed = [write_streamed(ladder, self.canvas or CANVAS)] if self.streamed_sog else []
+        return streamed + ([write_tiles(ladder)] if self.tiles else []) + page
 
 
 def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Exports, overwrite: bool) -> tuple[dict[str, Any], list[Path]]:
     """Make and save a ladder; return its manifest and what was written besides the levels. Raises OutputExists and SettingsError at once, but for
     Streamed SOG of a ladder that comes out as a single level, because that has few enough splats or no other is of use."""
-    from mipmap_plugin.levels.ladder import refuse_no_viewer
+    from mipmap_plugin.levels.ladder import make_levels, refuse_no_viewer
     from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
     from mipmap_plugin.levels.room import room_for
     from mipmap_plugin.levels.store import is_of
@@ -90,7 +87,8 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
         refuse_far(output, wrapped.model.parameters(), "leave --tiles out")
     if not wrapped.cameras:
         warnings.warn(NO_CAMERAS, stacklevel=2)
-    ladder = _made(wrapped, request, unfinished)
+    with _kept(unfinished):
+        ladder = make_levels(wrapped, request, resume=unfinished)
     if exports.streamed_sog and len(ladder.levels) == 1:
         # Other numbers would make another ladder, and a smaller --coarsest may make more levels that are left out.
         raise SettingsError(f"{SINGLE_LEVEL}; leave --streamed-sog out, which goes on from what is made")
@@ -104,14 +102,6 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
         raise type(error)(f"{str(error) or 'interrupted'}; {again}") from error
     ladder.forget()
     return read_manifest(folder), files
-
-
-def _made(wrapped: Wrapped, request: LadderRequest, unfinished: Path) -> Ladder:
-    """The ladder, whose levels `unfinished` keeps as they are made. Raises what `make_levels` raises."""
-    from mipmap_plugin.levels.ladder import make_levels
-
-    with _kept(unfinished):
-        return make_levels(wrapped, request, resume=unfinished)
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from importlib.metadata import entry_points
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import tyro
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 GROUPS = ("backends", "models", "recipes", "upsamplers", "viewers")
 
 Kind = Literal["families", "recipes", "viewers", "backends", "upsamplers"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
 
 
 def list_(kinds: tyro.conf.Positional[tuple[Kind, ...]] = (), json: bool = False) -> None:
@@ -48,10 +49,10 @@ def warn_of_other_groups() -> None:
             warnings.warn(f"{names}, in the group {group} of entry points, is not used: the groups are {', '.join(known)}", stacklevel=2)
 
 
-def _facts(kind: str) -> dict[str, Any]:
+def _facts(kind: Kind) -> dict[str, Any]:
     """What is known of a kind: names that are built in, and what packages add, with its place and what is wrong with it."""
     with uncollected():  # some import torch
-        registry, find = KINDS[kind]()
+        registry, find = registry_of(kind)
     added = {
         name: "; not used, as the name is the same: ".join([f"{first}{_trouble(name, registry, find)}", *others])
         for name, (first, *others) in registry.packages().items()
@@ -63,38 +64,27 @@ def _facts(kind: str) -> dict[str, Any]:
     return {"built in": [name for name in built_in if name not in refused], "refused": refused, "of packages": added}
 
 
-def _families() -> tuple[Registry, Callable[[str], Any]]:
-    from mipmap_plugin.models.families import FAMILIES, find_family
+def registry_of(kind: Kind) -> tuple[Registry, Callable[[str], Any]]:
+    """The registry of a kind, and what finds one by name and checks it."""
+    if kind == "families":
+        from mipmap_plugin.models.families import FAMILIES, find_family
 
-    return FAMILIES, find_family
+        return FAMILIES, find_family
+    if kind == "recipes":
+        from mipmap_plugin.recipes import RECIPES, recipe
 
+        return RECIPES, lambda name: [recipe(name, scale) for scale in (1 / 4, 4)]
+    if kind == "viewers":
+        from mipmap_plugin.splatting.viewers import VIEWERS, find_viewer, viewers_for
 
-def _recipes() -> tuple[Registry, Callable[[str], Any]]:
-    from mipmap_plugin.recipes import RECIPES, recipe
+        return VIEWERS, lambda name: [find_viewer(member) for member in viewers_for(name)]
+    if kind == "backends":
+        from mipmap_plugin.backends import BACKENDS, get_backend
 
-    return RECIPES, lambda name: [recipe(name, scale) for scale in (1 / 4, 4)]
-
-
-def _viewers() -> tuple[Registry, Callable[[str], Any]]:
-    from mipmap_plugin.splatting.viewers import VIEWERS, find_viewer, viewers_for
-
-    return VIEWERS, lambda name: [find_viewer(member) for member in viewers_for(name)]
-
-
-def _backends() -> tuple[Registry, Callable[[str], Any]]:
-    from mipmap_plugin.backends import BACKENDS, get_backend
-
-    return BACKENDS, get_backend
-
-
-def _upsamplers() -> tuple[Registry, Callable[[str], Any]]:
+        return BACKENDS, get_backend
     from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS, find_upsampler
 
     return UPSAMPLERS, find_upsampler
-
-
-# The registry of each kind, and what finds one by name and checks it.
-KINDS = {"families": _families, "recipes": _recipes, "viewers": _viewers, "backends": _backends, "upsamplers": _upsamplers}
 
 
 def _trouble(name: str, registry: Registry, find: Callable[[str], Any]) -> str:

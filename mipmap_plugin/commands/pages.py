@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import this_command
-from mipmap_plugin.errors import plural
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
 from mipmap_plugin.formats.here import from_here
 
@@ -37,13 +36,6 @@ def evaluation_page_path(checkpoint: Path, output: Path | None) -> Path:
     name = checkpoint.resolve().name
     free = (Path(f"{name}.evaluation{f'-{number}' if number > 1 else ''}.html") for number in count(1))
     return next(path for path in free if not os.path.lexists(path))
-
-
-def evaluation_gallery(base: Wrapped, protocol: str, judged: int, recipes: Sequence[str]) -> Gallery:
-    """What keeps the pictures of an evaluation by `judged` photographs."""
-    from mipmap_plugin.pages.gallery import Gallery
-
-    return Gallery(base, f"photographs, protocol {protocol}, {plural(judged, 'view')}", recipes)
 
 
 def write_evaluation_page(

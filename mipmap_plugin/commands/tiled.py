@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,7 @@ from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.errors import SettingsError, plural
 from mipmap_plugin.formats.here import from_here
 from mipmap_plugin.jobs.base import Base
-from mipmap_plugin.jobs.job import Job, Outcome
+from mipmap_plugin.jobs.job import Job
 
 if TYPE_CHECKING:
     from mipmap_plugin.tiles.run import Joined
@@ -28,16 +29,13 @@ def adapt_tiled(many: Many, given: Sequence[Path], request: Request, base: Base,
     if many.send_files:
         raise SettingsError("--tiles needs a folder that all workers see, so that files are not sent; leave --send-files out")
 
-    def run(jobs: Sequence[Job]) -> Generator[Outcome, None, None]:
-        return engine(many, jobs, threads)
-
     jobs = jobs_of(given[0], request, base, several=len(request.targets) > 1)
     skip = many.skip_existing or (len(jobs) > 1 and not request.overwrite)  # as in a list
     reports = finished_before(jobs, json, may_load=False) if skip else {}  # the base may not fit into memory
     left = [job for job in jobs if job.target not in reports]
     unlock([job for job in jobs if job.target in reports])
     try:
-        for job, joined in zip(left, adapt_all_in_tiles(left, many.tiles, run, threads), strict=True):
+        for job, joined in zip(left, adapt_all_in_tiles(left, many.tiles, partial(engine, many, threads=threads), threads), strict=True):
             reports[job.target] = {"file": str(joined.file), **joined.facts()}
             if not json:
                 _say(job, many.tiles, joined)

@@ -58,9 +58,8 @@ def wrapped(text: str, hanging: int, width: int) -> str:
     """Wrap a text to `width` columns, all lines but the first indented by `hanging`. What follows NEXT stays on one line, to be copied."""
     words, found, command = text.partition(NEXT)
     kept = words + found + command.replace(" ", UNBROKEN)
-    lines = textwrap.wrap(
-        kept, max(width, hanging + LEAST_WIDTH), subsequent_indent=" " * hanging, break_long_words=False, break_on_hyphens=False
-    )  # fmt: skip
+    at_most = max(width, hanging + LEAST_WIDTH)
+    lines = textwrap.wrap(kept, at_most, subsequent_indent=" " * hanging, break_long_words=False, break_on_hyphens=False)
     return "\n".join(lines).replace(UNBROKEN, " ")
 
 

@@ -169,7 +169,7 @@ def _rays(camera: Camera, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def render_world(camera: Camera, *, samples: int = 16) -> Tensor:
+def render_world(camera: Camera, *, samples: int) -> Tensor:
     """The true image [H, W, 3], sRGB in 0..1 on white: a box filter over an n x n grid of `samples` = n² rays per pixel.
 
     Raises SettingsError where `samples` is not a square number.

@@ -28,7 +28,7 @@ class BackendStatus:
     name: str
     device: str
     reasons: tuple[str, ...]
-    note: str = ""  # the backend's own note
+    note: str  # the backend's own
 
 
 def listing() -> list[BackendStatus]:

@@ -32,7 +32,7 @@ from mipmap_plugin.evaluation.metrics import psnr, ssim
 from mipmap_plugin.evaluation.other_scene import of_another_scene, of_another_size
 from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.photographs import digest_of_image
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, not_held_out, views_of_placed
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, not_held_out, photographed_views
 from mipmap_plugin.evaluation.shots import Recorder, Shot, Watcher
 from mipmap_plugin.progress import Bar
 from mipmap_plugin.recipes import most_steps
@@ -158,16 +158,14 @@ def adapted_row(name: str, adapted: Adapted, judge: Evaluator) -> Row:
     return worst([row(viewer) for viewer in adapted.viewers])[0]
 
 
-def evaluator_of(
-    model: Wrapped, scene: Scene, protocol: str, perceptual: Perceptual | None = None, cells: Cells | None = None
-) -> Evaluator:
+def evaluator_of(model: Wrapped, scene: Scene, protocol: str, perceptual: Perceptual | None = None, cells: Cells | None = None) -> Evaluator:
     """What compares a model with the photographs of its scene; `cells`: where finished rows are kept. Raises SettingsError."""
     if protocol not in (names := [*PROTOCOLS]):
         raise SettingsError(unknown("protocol", str(protocol), names))
     scene = model.place(scene)
     if doubt := of_another_size(model, scene):
         warnings.warn(doubt, stacklevel=2)
-    views, notes = views_of_placed(model, scene), [*scene.notes, *not_held_out(model, scene)]
+    views, notes = photographed_views(model, scene), [*scene.notes, *not_held_out(model, scene)]
     return Evaluator(views, PROTOCOLS[protocol], perceptual, scene.source.name, cells=cells or Cells(), notes=notes)
 
 

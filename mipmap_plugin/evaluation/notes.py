@@ -14,9 +14,7 @@ from mipmap_plugin.recipes import most_steps
 from mipmap_plugin.wrap import Wrapped
 
 
-def notes(
-    model: Wrapped, judge: Evaluator, scales: Sequence[float], recipes: Sequence[str], settings: dict[str, Any], appearance: str
-) -> list[str]:
+def notes(model: Wrapped, judge: Evaluator, scales: Sequence[float], recipes: Sequence[str], settings: dict[str, Any], appearance: str) -> list[str]:
     """Notes on the scene, missing rows, exposures, the appearance of test views and filters, in sentences. `settings`: as of `all_rows`."""
     missing = {name: model.lacks(name) for name in FILTERS if any(scale != 1 for scale in scales)}
     rows = [f"there is no row {name!r}, since {reason}" for name, reason in missing.items() if reason]

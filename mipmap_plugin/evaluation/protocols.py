@@ -145,12 +145,7 @@ def ready_made(photograph: Path, size: tuple[int, int]) -> Path:
 
 
 def photographed_views(model: Wrapped, scene: Scene) -> list[TestView]:
-    """`test_views` of the scene of a model. Raises SettingsError, too, if the model has no cameras and gets none of the scene."""
-    return views_of_placed(model, model.place(scene))
-
-
-def views_of_placed(model: Wrapped, scene: Scene) -> list[TestView]:
-    """`photographed_views` of a scene that is in the frame of the model already (`Wrapped.place`)."""
+    """`test_views` of a placed scene (`Wrapped.place`). Raises SettingsError, too, if the model has no cameras."""
     if not model.cameras:
         raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder, or its cameras (--cameras)")
     return test_views(scene, model.cameras, model.background)

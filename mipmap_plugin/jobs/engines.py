@@ -25,7 +25,7 @@ def in_this_process(jobs: Sequence[Job], threads: int | None = None) -> Generato
         yield run(job, threads)
 
 
-def in_workers(jobs: Sequence[Job], count: int, threads: int | None = None) -> Generator[Outcome, None, None]:
+def in_workers(jobs: Sequence[Job], count: int, threads: int | None) -> Generator[Outcome, None, None]:
     """Do the jobs in at most `count` processes that share `threads` threads (None: all); yield each outcome when it is there.
 
     Ctrl-C lets every running job save its state, and begins no other; a second one ends them at once. What was registered in this

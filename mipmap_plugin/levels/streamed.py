@@ -58,7 +58,7 @@ TOO_SMALL = "PlayCanvas changes no level nearer than {least:g} units, and level 
 MOVED = 1 / 50
 
 
-def distances(manifest: dict[str, Any], canvas: int = CANVAS) -> list[float]:
+def distances(manifest: dict[str, Any], canvas: int) -> list[float]:
     """The distances from splats, in world units and a field of view of 45°, at which the levels of a ladder should be switched, rising."""
     return [canvas / 2 * manifest["base_pixel"] / (math.tan(math.pi / 8) * switch["zoom"]) for switch in manifest["switches"]]
 
@@ -112,7 +112,7 @@ def progression(rising: Sequence[float], ratio: float) -> tuple[float, float]:
     return max(math.exp(fmean(logs) - slope * middle), NEAREST), math.exp(slope)
 
 
-def viewer_settings(manifest: dict[str, Any], approach: Approach, canvas: int = CANVAS) -> dict[str, Any]:
+def viewer_settings(manifest: dict[str, Any], approach: Approach, canvas: int) -> dict[str, Any]:
     """What a page has to set on its PlayCanvas splat component (the first two) and on `scene.gsplat`, and the zooms at which levels then change."""
     rising, scales = distances(manifest, canvas), [level["scale"] for level in manifest["levels"]]
     if manifest.get("by") == "distance":  # such levels are made for distances from chunks, not from splats

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 from torch import Tensor
 
@@ -43,7 +41,7 @@ def viewer_pictures(base: Wrapped, adapted: Adapted, camera: Camera, truth: Tens
     file = Wrapped(adapted.model, base.cameras, adapted.backend.name, base.trained)
     made_for = made_for_viewers(adapted)
     names = dict.fromkeys((*made_for, *VIEWERS))
-    return [_in_viewer(name, {"base": base, "adapted": file}, view, part, name in made_for) for name in names]
+    return [_in_viewer(name, (base, file), view, part, name in made_for) for name in names]
 
 
 def made_for_viewers(adapted: Adapted) -> list[str]:
@@ -59,8 +57,8 @@ def middle(image: Tensor, view: Camera) -> Tensor:
     return image[top : top + view.height, left : left + view.width]
 
 
-def _in_viewer(name: str, models: Mapping[str, Wrapped], view: Camera, truth: Tensor | None, made_for: bool) -> ViewerPictures:
-    base, adapted = (models[key].render(view, viewer=name).image for key in ("base", "adapted"))
+def _in_viewer(name: str, models: tuple[Wrapped, Wrapped], view: Camera, truth: Tensor | None, made_for: bool) -> ViewerPictures:
+    base, adapted = (model.render(view, viewer=name).image for model in models)
     return ViewerPictures(
         name,
         find_viewer(name).title,

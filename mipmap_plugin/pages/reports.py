@@ -38,7 +38,7 @@ def tradeoff_page(title: str, base: Wrapped, facts: dict[str, Any], commands: Se
 
 
 def adaptation_page(
-    title: str, zooms: Sequence[Zoom], adaptations: Sequence[dict[str, Any]], commands: Sequence[str], before: Sequence[dict[str, Any]] = ()
+    title: str, zooms: Sequence[Zoom], adaptations: Sequence[dict[str, Any]], commands: Sequence[str], before: Sequence[dict[str, Any]]
 ) -> Page:
     """The page of adapted files: their pictures (`adaptation_zoom`) and their reports, and those of files that were finished `before`."""
     lead = " ".join(_gain(zoom, report) for zoom, report in zip(zooms, adaptations, strict=True))

@@ -56,17 +56,20 @@ class Joined:
         return {**self.report.model_dump(), "tiles": self.tiles}
 
 
-def adapt_in_tiles(job: Job, tiles: int, engine: Engine = in_this_process, threads: int | None = None) -> Joined:
+def adapt_in_tiles(job: Job, tiles: int, engine: Engine = in_this_process) -> Joined:
     """Adapt a checkpoint in `tiles` tiles, each a job that `engine` runs, and write it to `job.target`, a .ply or a model folder.
 
-    What is done stays in a folder beside the target until all is: the same call goes on from there. `threads`: for what is done between
-    the jobs. Raises SettingsError and OutputExists before any work, JobsFailed if a job failed, and what loading raises.
+    What is done stays in a folder beside the target until all is: the same call goes on from there. Raises SettingsError and OutputExists before
+    any work, JobsFailed if a job failed, and what loading raises.
     """
-    return next(adapt_all_in_tiles([job], tiles, engine, threads))
+    return next(adapt_all_in_tiles([job], tiles, engine))
 
 
 def adapt_all_in_tiles(jobs: Sequence[Job], tiles: int, engine: Engine = in_this_process, threads: int | None = None) -> Iterator[Joined]:
-    """`adapt_in_tiles` of one base for several scales or viewers: it is cut once, and each picture of it is drawn once for all that need it."""
+    """`adapt_in_tiles` of one base for several scales or viewers: it is cut once, and each picture of it is drawn once for all that need it.
+
+    `threads`: for what is done between the jobs.
+    """
     for job in jobs:
         refuse(job, tiles)
     with alone(jobs):

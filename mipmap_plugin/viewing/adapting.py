@@ -17,7 +17,7 @@ from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import psnr_as_shown
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import MipmapPluginError, SettingsError
-from mipmap_plugin.viewing.around import views_for_screen
+from mipmap_plugin.viewing.around import middle, views_for_screen
 from mipmap_plugin.viewing.sources import File, Request, Supersampled
 from mipmap_plugin.wrap import Wrapped
 
@@ -141,8 +141,7 @@ class Adapter:
 
     def _observer(self, wish: Wish) -> Callable[[int, float, Callable[[Camera], Tensor]], bool]:
         """A function that the run calls after each step: it draws a picture that is waited for, and now and then measures that of the screen."""
-        side = math.sqrt(min(1.0, MEASURED_PIXELS / (wish.screen.width * wish.screen.height)))
-        judged = wish.screen.window(max(1, int(side * wish.screen.width)), max(1, int(side * wish.screen.height)))
+        judged = middle(wish.screen, MEASURED_PIXELS)
         request = Request(judged, wish.zoom, wish.viewer)
         truth, measured = self._reference.render(request).clamp(0, 1), -math.inf
         self._set(base_db=psnr_as_shown(self._shown.render(request), truth))

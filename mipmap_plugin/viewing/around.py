@@ -31,7 +31,7 @@ def views_for_screen(base: Wrapped, screen: Camera, look_at: Tensor, scale: floa
     near = [part(turned(screen, look_at, number), means, scale, number).zoomed(1 / scale) for number in range(NEAR)]
     given = base.cameras or base.viewpoints.best(evenly(base.views(), OWN))
     train = [view for view in given if view.split == "train"] or given
-    own = [middle(view, scale) for view in evenly(train, OWN)]
+    own = [middle(view, PIXELS / scale**2) for view in evenly(train, OWN)]
     return [replace(view, name=f"screen_{number}", base_zoom=view.zoom, index=own[0].index) for number, view in enumerate(near)] + own
 
 
@@ -45,9 +45,9 @@ def turned(screen: Camera, look_at: Tensor, number: int) -> Camera:
     return screen.looking_from(viewmat_of(turn @ rotation, center), screen.name)
 
 
-def middle(view: Camera, scale: float) -> Camera:
-    """The middle of a view of the base's scale, of at most `PIXELS` px at the new one."""
-    fraction = min(1.0, math.sqrt(PIXELS / (view.width * view.height)) / scale)
+def middle(view: Camera, pixels: float) -> Camera:
+    """The middle of a view, of at most so many px."""
+    fraction = min(1.0, math.sqrt(pixels / (view.width * view.height)))
     return view.window(max(1, int(fraction * view.width)), max(1, int(fraction * view.height)))
 
 

@@ -43,7 +43,7 @@ class Controls:
     """The elements of the panel."""
 
     def __init__(
-        self, gui: Any, names: Sequence[str], viewers: Sequence[str], views: Sequence[str], recipes: Sequence[str], moment: float | None = None
+        self, gui: Any, names: Sequence[str], viewers: Sequence[str], views: Sequence[str], recipes: Sequence[str], moment: float | None
     ) -> None:
         """`gui`: viser's; `names` of what can be shown; `viewers`, the chosen one first, None as AS_TRAINED; `moment`: of a moving scene, the
         one that is shown first."""

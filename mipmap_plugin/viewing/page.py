@@ -8,7 +8,6 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from mipmap_plugin.viewing.pace import STILL_S, Pace
 from mipmap_plugin.viewing.screen import Pose, by_distance, by_lens, pose_of, up_of, zoomed
 from mipmap_plugin.viewing.server import served, without_words
 from mipmap_plugin.viewing.sources import File, of_adapted
-from mipmap_plugin.viewing.stage import Look, Stage, smaller
+from mipmap_plugin.viewing.stage import Look, Stage, free_name, smaller
 
 OUT_OF_MEMORY = "out of memory; enlarge pixels, or make the window smaller"
 
@@ -266,8 +265,7 @@ def by_name(views: Sequence[Camera]) -> dict[str, Camera]:
     """The views by their names; a name that is taken gets a number, as where training and test views are both called r_0."""
     named: dict[str, Camera] = {}
     for number, view in enumerate(views):
-        name = view.name or f"view {number}"
-        named[name if name not in named else next(each for again in count(2) if (each := f"{name} ({again})") not in named)] = view
+        named[free_name(view.name or f"view {number}", named)] = view
     return named
 
 

@@ -88,9 +88,7 @@ def pose_of(camera: Camera, depth: float) -> Pose:
     """The pose of a camera that turns around the point in the middle of its picture at this depth (world units)."""
     rotation, center = camera.viewmat[:3, :3].T, camera.center
     fov = 2 * math.atan(camera.height / (2 * camera.fy))
-    return Pose(
-        tuple(quaternions(rotation[None])[0].tolist()), tuple(center.tolist()), tuple((center + depth * rotation[:, 2]).tolist()), fov,
-    )  # fmt: skip
+    return Pose(tuple(quaternions(rotation[None])[0].tolist()), tuple(center.tolist()), tuple((center + depth * rotation[:, 2]).tolist()), fov)
 
 
 def up_of(views: Sequence[Camera]) -> tuple[float, ...]:

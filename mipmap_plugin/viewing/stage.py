@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from dataclasses import dataclass, replace
+from itertools import count
 
 import torch
 from torch import Tensor
@@ -57,9 +58,7 @@ class Stage:
 
     def add(self, source: Source) -> str:
         """Show a further source, under a name that is free; return that name."""
-        name, number = source.name, 2
-        while name in self.sources:
-            name, number = f"{source.name} ({number})", number + 1
+        name = free_name(source.name, self.sources)
         self.sources[name] = source
         return name
 
@@ -82,6 +81,11 @@ class Stage:
                 image, psnr_db = (AMPLIFIED * difference.abs()).clamp(0, 1), decibel(float(difference.square().mean()))
         enlarged = whole_pixels(image, look.pixel, screen) if coarse == 1 else image
         return Picture(enlarged, drawn, zoom, source.shown(zoom), watch.seconds, source.splats(request), psnr_db)
+
+
+def free_name(name: str, taken: Container[str]) -> str:
+    """The name, with a number behind it where it is taken."""
+    return name if name not in taken else next(each for number in count(2) if (each := f"{name} ({number})") not in taken)
 
 
 def smaller(camera: Camera, factor: float) -> Camera:

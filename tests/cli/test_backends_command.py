@@ -9,7 +9,7 @@ from commands_run import refused
 
 from mipmap_plugin import register_backend, registry
 from mipmap_plugin.backends.conformance import CASES, MORE, Outcome
-from mipmap_plugin.commands.list import GROUPS, KINDS
+from mipmap_plugin.commands.list import GROUPS, KINDS, registry_of
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation import backends as backends_module
 
@@ -87,7 +87,7 @@ def test_list_says_where_names_come_from_and_what_is_wrong_with_one(run, tmp_pat
 
 
 def test_every_registry_reads_a_group_that_is_told():
-    assert sorted(find()[0].group for find in KINDS.values()) == [f"mipmap_plugin.{kinds}" for kinds in GROUPS]
+    assert sorted(registry_of(kind)[0].group for kind in KINDS) == [f"mipmap_plugin.{kinds}" for kinds in GROUPS]
 
 
 def test_no_backend_is_named_as_the_choice_of_one():

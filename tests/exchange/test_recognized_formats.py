@@ -21,7 +21,10 @@ from mipmap_plugin.models.adapted_name import adapted_name
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
-MADE = [("spz", SPZ), ("spz", gzip.compress(SPZ)), ("ksplat", b"\0\1\0\0" + bytes(6000)), ("splat", RECORD * 3)]
+# Without the time, which would be in the names of tests: those of all processes of pytest-xdist must be the same.
+ZIPPED = gzip.compress(SPZ, mtime=0)
+
+MADE = [("spz", SPZ), ("spz", ZIPPED), ("ksplat", b"\0\1\0\0" + bytes(6000)), ("splat", RECORD * 3)]
 
 
 @pytest.mark.parametrize(("ending", "content"), MADE, ids=["spz v4", "spz v2", "ksplat", "splat"])
@@ -99,9 +102,7 @@ def test_a_sog_whose_checksums_are_wrong_is_refused(tmp_path, tool):
         load_model(tmp_path / "a.sog")
 
 
-@pytest.mark.parametrize(
-    ("content", "why"), [(gzip.compress(SPZ)[:-12], "it is cut off"), (gzip.compress(SPZ) + b"ab", "other bytes follow its end")]
-)
+@pytest.mark.parametrize(("content", "why"), [(ZIPPED[:-12], "it is cut off"), (ZIPPED + b"ab", "other bytes follow its end")])
 def test_what_is_wrong_with_a_gzipped_spz_is_said(tmp_path, tool, content, why):
     """splat-transform told its time and memory, in place of a reason."""
     (tmp_path / "a.spz").write_bytes(content)

@@ -264,6 +264,15 @@ def test_the_db_of_a_file_are_of_what_its_format_keeps(tmp_path, capsys):
 
 
 @pytest.mark.usefixtures("rounding")
+def test_a_page_has_the_db_of_a_file_whose_path_is_relative(tmp_path, monkeypatch):
+    tiny.ply(tmp_path / "scan.ply")
+    monkeypatch.chdir(tmp_path)
+    assert main(["adapt", "scan.ply", "--scale", "1/4", "--steps", "0", "--output", "new.spz", "--report", "--quiet"]) == 0
+    written = json.loads((tmp_path / "new.spz.adaptation.json").read_text())["written"]
+    assert rf"\u2192 {written:.1f} dB on views" in (tmp_path / "new.spz.report.html").read_text()
+
+
+@pytest.mark.usefixtures("rounding")
 def test_the_db_in_each_of_several_viewers_are_of_what_a_format_keeps(tmp_path):
     adapted = wrap_model(tiny.ply(tmp_path / "scan.ply")).adapt(1 / 4, steps=0, merge_to=1.0, viewer="portable")
     exact, files = adapted.report.viewers, [adapted.save(tmp_path / f"a.{suffix}") for suffix in ("ply", "spz")]

@@ -20,17 +20,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import plural
 from mipmap_plugin.evaluation.cells import Cells, made_by
-from mipmap_plugin.evaluation.measure import (
-    BASE,
-    FILTERS,
-    Baseline,
-    RenderView,
-    adapt_alone,
-    base_in_viewer,
-    baselines,
-    warm_stopwatch,
-    warm_up,
-)  # fmt: skip
+from mipmap_plugin.evaluation.measure import BASE, FILTERS, Baseline, RenderView, adapt_alone, base_in_viewer, baselines, warm_stopwatch, warm_up
 from mipmap_plugin.evaluation.tradeoff.points import NOTHING, Plan, Point, Spread
 from mipmap_plugin.evaluation.tradeoff.truth import GroundTruth
 from mipmap_plugin.models.base import SplatModel, count_of

@@ -26,10 +26,10 @@ def run(model: Wrapped, scene: Scene | None, scales: Sequence[float], plan: Plan
     if views is not None and views < 1:
         raise SettingsError(f"views: at least 1 must be evaluated on, got {views}")
     model.refuse_undrawn(scale=min(scales))
-    truths = [base_itself(model, scale, views) if scene is None else photographs(model, scene, scale, views) for scale in scales]
+    there = model.place(scene) if scene else None
+    truths = [base_itself(model, scale, views) if there is None else photographs(model, there, scale, views) for scale in scales]
     made_from = {"base": model.model.digest, "asked": model.asked, "trained": str(model.trained), "scene": scene and scene.digest()}
     cells = Cells(folder.path / KEPT, made_from | {"views": views, "threads": model.threads})
-    there = model.place(scene) if scene else None
     notes = left_out(model, plan) + ([*there.notes, *not_held_out(model, there), *not_exposed(model.model)] if there else [])
     tradeoffs = [Tradeoff(scale, truth.label, [], notes) for scale, truth in zip(scales, truths, strict=True)]
     try:

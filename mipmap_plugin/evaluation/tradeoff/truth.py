@@ -43,7 +43,7 @@ class GroundTruth:
 
 
 def photographs(model: Wrapped, scene: Scene, scale: float, most: int | None) -> GroundTruth:
-    """At most `most` photographs, resized by protocol P3. If every camera has one, only every eighth is used.
+    """At most `most` photographs of a placed scene (`Wrapped.place`), resized by protocol P3. If every camera has one, only every eighth is used.
 
     Raises SettingsError if there are none, if they are too small, and if no other camera is left to adapt to.
     """

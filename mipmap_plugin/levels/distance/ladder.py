@@ -36,7 +36,7 @@ CHUNK = 0.5
 REPEATED = "nothing was better than the finer level as it is"
 
 
-def make_levels_by_distance(base: FrozenBase, request: LadderRequest, resume: Path | None = None) -> Ladder:
+def make_levels_by_distance(base: FrozenBase, request: LadderRequest, resume: Path | None) -> Ladder:
     """Make the levels. `resume`: as for `levels.ladder.make_levels`. Raises what that raises, and SettingsError for a model whose splats cannot be
     merged, or for settings that levels by distance do not have."""
     refuse(base, request)

@@ -22,7 +22,7 @@ class Contents:
     scene: Scene
     levels: list[Adapted]
     curve: list[WalkPoint]
-    left_out: Sequence[LeftOut] = ()  # beyond the last level, by falling scale
+    left_out: Sequence[LeftOut]  # beyond the last level, by falling scale
 
 
 def write(ladder: Contents, folder: Path, overwrite: bool) -> Path:
