@@ -6,7 +6,7 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.optimization.loop import _compare_all
+from mipmap_plugin.adaptation.optimization.comparing import compare
 from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR, gradient_of
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.models.vanilla import VanillaModel
@@ -57,5 +57,5 @@ def test_steps_leave_what_a_display_cannot_show(scale):
 def test_an_image_is_not_made_brighter_than_a_truth_that_is_brighter_than_white(shown, truth, excess):
     """As a bicubic filter makes truths beside edges. An image that counted as at most 1.02 there was made brighter without end."""
     task, config = SimpleNamespace(scale=1 / 4, detail=None), AdaptConfig(loss="psnr")
-    [(gradient, square_error)] = _compare_all(task, config, [None], [torch.full((2, 2, 3), shown)], [torch.full((2, 2, 3), truth)])
+    [(gradient, square_error)] = compare(task, config, [None], [torch.full((2, 2, 3), shown)], [torch.full((2, 2, 3), truth)])
     assert bool((gradient.sign() == torch.tensor(excess).sign()).all()) and float(square_error) == pytest.approx(excess**2, rel=1e-3)

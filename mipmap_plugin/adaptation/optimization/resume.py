@@ -10,9 +10,9 @@ from typing import Any, NoReturn
 import torch
 
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch
+from mipmap_plugin.adaptation.optimization.costs import Costs
 from mipmap_plugin.adaptation.optimization.density import ScreenGradients
 from mipmap_plugin.adaptation.optimization.ending import End
-from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.run import Run, Task, Trial
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot

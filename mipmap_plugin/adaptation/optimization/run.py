@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,9 +15,9 @@ from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, progr
 from mipmap_plugin.adaptation.following import Following
 from mipmap_plugin.adaptation.optimization.adam import Adam
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
+from mipmap_plugin.adaptation.optimization.costs import Costs
 from mipmap_plugin.adaptation.optimization.density import ScreenGradients
 from mipmap_plugin.adaptation.optimization.ending import End
-from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.quickest import QuickestThreads
 from mipmap_plugin.adaptation.optimization.validation import Steering, Validation
@@ -143,12 +144,16 @@ class Run:
         """What is gone of a time budget."""
         return self.watch.seconds + self.reserved
 
+    def budget_left(self, config: AdaptConfig) -> float:
+        """Seconds of a time budget that are left; infinity without one."""
+        return math.inf if config.time_budget_s is None else max(0.0, config.time_budget_s - self.seconds)
+
     def reason_to_stop(self, config: AdaptConfig) -> End | None:
         """Why it ends before its last step: the budget is spent, the target reached, or the knee passed; None to continue."""
-        if config.time_budget_s is not None and self.seconds >= config.time_budget_s:
+        if not self.budget_left(config):
             if self.step:
                 return End.TIME
-            return End.START if self.watch.seconds >= config.time_budget_s else End.CHOICE
+            return End.START if self.watch.seconds >= (config.time_budget_s or 0.0) else End.CHOICE
         psnrs = [point.psnr_db for point in self.curve if point.psnr_db is not None]
         if config.target_db is not None and psnrs and psnrs[-1] >= config.target_db:
             return End.TARGET
