@@ -24,7 +24,6 @@ from mipmap_plugin.errors import CheckpointError, OutputError, SettingsError
 from mipmap_plugin.formats.atomic import refuse_output
 from mipmap_plugin.formats.torch_file import load_torch, save_torch
 from mipmap_plugin.models.base import SplatModel
-from mipmap_plugin.splatting.bands import neighbors
 
 # Seconds between two saved states: the most that a killed process loses. A state is about three times as large as the model, four times
 # with growth on trial.
@@ -158,19 +157,9 @@ def load_run(state: dict[str, Any], student: SplatModel, config: AdaptConfig) ->
         if not isinstance(state[name], kind):
             raise TypeError(f"{name} must be of type {kind.__name__}")
     device, still = student.parameters()["means"].device, [name for name, tensor in student.parameters().items() if not tensor.requires_grad]
-    # A GPU sums blend weights in any order, so that merging again may leave another number of splats.
-    if state["rows_changed"] or state["parameters"]["means"].shape != student.parameters()["means"].shape:
-        rows = neighbors({name: tensor.to(device) for name, tensor in state["parameters"].items()})
-        student.replace_parameters({name: tensor.requires_grad_() for name, tensor in rows.items()})
-        for name in still:  # as in an uninterrupted run, whose steps are others with a gradient more
-            student.parameters()[name].requires_grad_(False)
-    else:  # the rows are those that the run began with, so that the model's other data by row still match them
-        with torch.no_grad():
-            for name, tensor in student.parameters().items():
-                tensor.copy_(state["parameters"][name])
-    with torch.no_grad():
-        for name, tensor in student.shared_parameters().items():
-            tensor.copy_(state["shared"][name])
+    Snapshot(state["parameters"], state["shared"]).to(device).put_into(student, anew=state["rows_changed"])
+    for name in still:  # as in an uninterrupted run, whose steps are others with a gradient more
+        student.parameters()[name].requires_grad_(False)
     if state["held"] is not None:
         student.held = state["held"].to(device)  # type: ignore[attr-defined]  # of a model that follows its splats
     optimizer = make_optimizer(student, config, pixel=1.0)  # the state holds the actual rates
