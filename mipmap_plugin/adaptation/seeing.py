@@ -26,23 +26,17 @@ def seeing(cameras: Sequence[Camera], means: Tensor, near: float) -> list[Camera
     """
     if len(cameras) < 2:
         return list(cameras)
-    frames = {_larger(camera): camera for camera in cameras}
-    found = {frames[frame] for frame in _seeing(list(frames), means, near)}
-    kept = [camera for camera in cameras if camera in found]
+    frames = {_larger(camera): camera for camera in cameras}  # of cameras that saw nothing so far
+    for most in SAMPLES:
+        for frame in showing(list(frames), means[:: max(1, len(means) // most)], near):
+            del frames[frame]
+    others = set(frames.values())
+    kept = [camera for camera in cameras if camera not in others]
     blind = len(cameras) - len(kept)
     if not blind or not any(camera.split == "train" for camera in kept):
         return list(cameras)
     warn(f"{blind} of {len(cameras)} cameras {'sees' if blind == 1 else 'see'} no splat, or hardly any, and {'is' if blind == 1 else 'are'} left out")
     return kept
-
-
-def _seeing(frames: Sequence[Camera], means: Tensor, near: float) -> list[Camera]:
-    """The frames with one of the `means` [N, 3] inside; only some of many means are looked for, evenly chosen."""
-    found = dict[Camera, None]()
-    for most in SAMPLES:
-        others = [frame for frame in frames if frame not in found]
-        found |= dict.fromkeys(showing(others, means[:: max(1, len(means) // most)], near))
-    return list(found)
 
 
 def _larger(camera: Camera) -> Camera:

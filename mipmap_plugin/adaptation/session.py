@@ -94,7 +94,8 @@ class Session:
             validation = shown
         if self.base.traits.moves:
             moments = None if self._has_photographs else affordable_moments(self.config, self.base)  # a photograph shows no moment but its own
-            views, validation, note = at_their_moments(views, validation, self.config.model_copy(update={"moments": moments}), note)
+            views, validation, times = at_their_moments(views, validation, moments, self.config.seed)
+            note += f", {times}"
         return views, validation, note
 
     def _looking(self) -> AbstractContextManager[None]:

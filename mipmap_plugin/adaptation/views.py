@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import torch
 
-from mipmap_plugin.adaptation.spreading import Halves, places, spread
+from mipmap_plugin.adaptation.spreading import halves_of, places, spread
 from mipmap_plugin.adaptation.viewpoints import Viewpoints
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
@@ -76,7 +76,7 @@ class Rounds:
     def __init__(self, views: Sequence[Camera], seed: int, *, spread_out: bool = False) -> None:
         """`spread_out`: neighbors look from all sides; otherwise the order is shuffled."""
         self.views, self._seed = list(views), seed
-        self._halves = Halves.of(range(len(views)), places(views)) if spread_out and views else None
+        self._halves = halves_of(range(len(views)), places(views)) if spread_out and views else None
         self._round = -1
         self._order: list[int] = []
 

@@ -94,13 +94,6 @@ class Trial:
     passed: bool = False  # a growth has been assessed and kept
     undone_at: int | None = None  # the step at which a growth was undone
 
-    @classmethod
-    def begin(cls, student: SplatModel, task: Task, config: AdaptConfig) -> Trial | None:
-        """The trial of a run that begins with `student`; None if growth is never undone."""
-        if config.densify_on_trial and config.densify_gradient is not None:
-            return cls(task.agreement(student, config))
-        return None
-
 
 @dataclass
 class Run:
@@ -129,7 +122,8 @@ class Run:
         means = student.parameters()["means"]
         optimizer, watch = make_optimizer(student, config, task.pixel(student)), Stopwatch(seconds=spent)
         with watch:
-            trial, costs = Trial.begin(student, task, config), Costs(motion=lambda: task.follow.seconds, device=means.device)
+            trial = Trial(task.agreement(student, config)) if config.densify_on_trial and config.densify_gradient is not None else None
+            costs = Costs(motion=lambda: task.follow.seconds, device=means.device)
             quality = costs.check(lambda: task.validation.quality(student))
             steering = Steering.begin(student, quality.visible)
         first = CurvePoint(step=0, seconds=watch.read(), psnr_db=None, validation_db=quality.psnr, gaussians=task.count(student))
