@@ -17,7 +17,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.tiles.cut import front_to_back
 from mipmap_plugin.tiles.folder import halo_file, layer_file
 from mipmap_plugin.tiles.layers import box_of, on_black, within
-from mipmap_plugin.tiles.pictures import Album, Box, write_pictures
+from mipmap_plugin.tiles.pictures import Album, Box, new_pictures
 from mipmap_plugin.tiles.scene import TiledScene
 from mipmap_plugin.tiles.slabs import Layer
 from mipmap_plugin.tiles.steering import Steered, open_state
@@ -39,14 +39,11 @@ def draw_halos(scene: TiledScene, part: int, sweep: Sweep) -> None:
     splats, painter = open_state(scene, Steered.before(scene.folder, sweep.number)), scene.painter(on_black(scene.target))
     layers = [Album([layer_file(scene.folder, number, sweep.halos)]) for number in range(len(scene.cores))]
     background = torch.tensor(scene.target.background)
-
-    def pictures() -> Iterator[tuple[str, Tensor, Box | None]]:
+    with new_pictures(halo_file(scene.folder, part, sweep.halos)) as write:
         for view in part_of(scene.sweep_views(sweep), part):
-            yield view.name, in_16_bits(painter.draw(splats, view.zoomed(scene.scale)).over(background)), None
+            write(view.name, in_16_bits(painter.draw(splats, view.zoomed(scene.scale)).over(background)), None)
             for number, halo, box in _halos(scene, view, layers):
-                yield f"{view.name}/{number}", halo, box
-
-    write_pictures(halo_file(scene.folder, part, sweep.halos), pictures())
+                write(f"{view.name}/{number}", halo, box)
 
 
 def _halos(scene: TiledScene, view: Camera, layers: list[Album]) -> Iterator[tuple[int, Tensor, Box]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -11,7 +10,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.renderers import unrounded
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.tiles.folder import layer_file
-from mipmap_plugin.tiles.pictures import Box, write_pictures
+from mipmap_plugin.tiles.pictures import Box, new_pictures
 from mipmap_plugin.tiles.scene import TiledScene
 from mipmap_plugin.tiles.slabs import BLACK
 from mipmap_plugin.tiles.steering import Steered
@@ -29,15 +28,12 @@ def draw_layers(scene: TiledScene, number: int, sweep: Sweep) -> None:
     """Draw a tile in each of a sweep's views, and write [h, w, 4] half of each: the picture on black, and the transmittance."""
     splats = scene.kind(Store(Steered.before(scene.folder, sweep.number).file(scene.folder, number)).parameters()).gaussians()
     effects = on_black(scene.target)
-
-    def pictures() -> Iterator[tuple[str, Tensor, Box]]:
+    with new_pictures(layer_file(scene.folder, number, sweep.halos)) as write:
         for view in scene.sweep_views(sweep):
             rendered = scene.backend.render(splats, view.zoomed(scene.scale), effects)
             if (box := box_of(rendered.alpha > 0)) is not None:
                 layer = torch.cat([rendered.image, (1 - rendered.alpha)[..., None]], dim=2)
-                yield view.name, within(layer, box).half(), box
-
-    write_pictures(layer_file(scene.folder, number, sweep.halos), pictures())
+                write(view.name, within(layer, box).half(), box)
 
 
 def box_of(shown: Tensor, pad: int = 0) -> Box | None:

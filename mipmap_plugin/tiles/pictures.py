@@ -21,8 +21,6 @@ KINDS = {"half": torch.float16, "int16": torch.int16, "uint8": torch.uint8}
 
 Box = tuple[int, int, int, int]  # left, top, right, bottom, px of the view
 
-Picture = tuple[str, Tensor, Box | None]  # its name, and what it shows of its view; None: all
-
 
 class _Entry(NamedTuple):
     """One picture of a file."""
@@ -34,16 +32,12 @@ class _Entry(NamedTuple):
     box: Box | None  # what it shows of its view; None: all
 
 
-def write_pictures(path: Path, pictures: Iterable[Picture]) -> None:
-    """Write pictures of the types of `KINDS` as they come, atomically; an old file is replaced. Raises OutputError."""
-    with new_pictures(path) as write:
-        for picture in pictures:
-            write(*picture)
-
-
 @contextmanager
 def new_pictures(path: Path) -> Iterator[Callable[[str, Tensor, Box | None], None]]:
-    """What writes pictures, as `write_pictures`; the file is there when the block succeeds."""
+    """A function that writes a picture of a type of `KINDS` by name, and what it shows of its view (None: all).
+
+    The file is there when the block succeeds; an old one is replaced. Raises OutputError.
+    """
     names = {kind: name for name, kind in KINDS.items()}
     table = {}
     with new_file(path, overwrite=True) as temporary, temporary.open("wb") as file:

@@ -67,28 +67,24 @@ def adapt_in_tiles(job: Job, tiles: int, engine: Engine = in_this_process, threa
 
 def adapt_all_in_tiles(jobs: Sequence[Job], tiles: int, engine: Engine = in_this_process, threads: int | None = None) -> Iterator[Joined]:
     """`adapt_in_tiles` of one base for several scales or viewers: it is cut once, and each picture of it is drawn once for all that need it."""
+    if not jobs:
+        return
     for job in jobs:
         refuse(job, tiles)
     with alone(jobs):
-        yield from _adapt_all(jobs, tiles, engine, threads)
-
-
-def _adapt_all(jobs: Sequence[Job], tiles: int, engine: Engine, threads: int | None) -> Iterator[Joined]:
-    began = time.perf_counter()
-    if not jobs:
-        return
-    claim(jobs, tiles)
-    with announced("cutting"):
-        cut_for(jobs, tiles)
-    return_freed_memory()
-    with _uncut_if_refused(jobs):
-        for job in jobs:
-            _opened(job).wrapped.refuse_output(job.target, overwrite=job.overwrite, networks_move=False, viewer=job.viewer)
-        _examine_views(jobs)
-    for number, job in enumerate(jobs):
-        stages = _Stages(job, tuple(jobs[number + 1 :]), engine, {"cutting": time.perf_counter() - began})
-        yield _adapted_and_saved(_opened(job), stages, began, threads)
         began = time.perf_counter()
+        claim(jobs, tiles)
+        with announced("cutting"):
+            cut_for(jobs, tiles)
+        return_freed_memory()
+        with _uncut_if_refused(jobs):
+            for job in jobs:
+                _opened(job).wrapped.refuse_output(job.target, overwrite=job.overwrite, networks_move=False, viewer=job.viewer)
+            _examine_views(jobs)
+        for number, job in enumerate(jobs):
+            stages = _Stages(job, tuple(jobs[number + 1 :]), engine, {"cutting": time.perf_counter() - began})
+            yield _adapted_and_saved(_opened(job), stages, began, threads)
+            began = time.perf_counter()
 
 
 def _opened(job: Job) -> TiledScene:

@@ -19,7 +19,6 @@ from mipmap_plugin.adaptation.start.merging import merge_seen
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.process import pool
 from mipmap_plugin.tiles.folder import START, start_file
 from mipmap_plugin.tiles.scene import TiledScene
@@ -156,7 +155,7 @@ class StartSearch:
         opacities = matched_opacities(opacities, wanted, whole, weights_of)
         for number, (part, matched) in enumerate(zip(splats.parts, opacities.split([*map(len, splats.parts)]), strict=True)):
             model = self.scene.for_target(part.parameters())
-            _set_opacities(model, matched)
+            model.reshape(lambda gaussians: (gaussians.scales, matched))  # noqa: B023  # it is called at once
             write_store(self._file(name, number), model.parameters())
 
     def _take_base(self, psnr: float) -> None:
@@ -171,10 +170,6 @@ class StartSearch:
             for other in CANDIDATES:
                 self._file(other, number).unlink(missing_ok=True)
         save_torch(self.scene.folder / START, {"name": title, "psnr": psnr}, overwrite=True)
-
-
-def _set_opacities(model: VanillaModel, opacities: Tensor) -> None:
-    model.reshape(lambda gaussians: (gaussians.scales, opacities))
 
 
 @torch.no_grad()

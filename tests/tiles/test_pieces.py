@@ -20,7 +20,7 @@ from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.tiles import slabs
 from mipmap_plugin.tiles.cut import cut, front_to_back
 from mipmap_plugin.tiles.folder import CUT
-from mipmap_plugin.tiles.pictures import Album, write_pictures
+from mipmap_plugin.tiles.pictures import Album, new_pictures
 from mipmap_plugin.tiles.reading import make_cut
 from mipmap_plugin.tiles.slabs import Painter
 from mipmap_plugin.tiles.splats import Splats
@@ -130,7 +130,9 @@ def test_slabs_are_cut_by_depth():
 def test_pictures_come_back_one_by_one(tmp_path):
     small = torch.full((1, 1, 5), 7).to(torch.uint8)
     pictures = {"1": torch.rand(3, 4, 3).half(), "2": torch.randint(-9, 9, (2, 5, 3), dtype=torch.int16), "2/0": small}
-    write_pictures(tmp_path / "a", ((name, picture, (1, 2, 3, 4) if "/" in name else None) for name, picture in pictures.items()))
+    with new_pictures(tmp_path / "a") as write:
+        for name, picture in pictures.items():
+            write(name, picture, (1, 2, 3, 4) if "/" in name else None)
     album = Album([tmp_path / "a"])
     assert all(torch.equal(album[name], picture) for name, picture in pictures.items())
     assert album.box("2/0") == (1, 2, 3, 4) and album.box("1") is None and "3" not in album
