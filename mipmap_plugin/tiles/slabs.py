@@ -99,18 +99,13 @@ class Painter:
         through = torch.ones(*camera.size, 1)
         for slab in parts:
             gaussians = splats.gaussians(slab, colored=False)
-            if len(parts) == 1 and (known := self._known_weights(gaussians, camera, effects)) is not None:
+            weigh = getattr(self.backend, "blend_weights", None) if len(parts) == 1 else None  # which knows nothing of what is in front
+            if weigh is not None and (known := weigh(gaussians, camera, effects)) is not None:
                 weights[slab] += known
                 return
             weights[slab] += self._slab_weights(gaussians, camera, effects, through)
             if float(through.max()) < effects.settings.min_transmittance:
                 return
-
-    def _known_weights(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor | None:
-        """The blend weights [M] that the backend computes itself, if it can, of splats with nothing in front of them."""
-        weigh = getattr(self.backend, "blend_weights", None)
-        known: Tensor | None = None if weigh is None else weigh(gaussians, camera, effects)
-        return known
 
     @torch.enable_grad()
     def _slab_weights(self, gaussians: Gaussians, camera: Camera, effects: Effects, through: Tensor) -> Tensor:
