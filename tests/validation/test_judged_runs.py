@@ -12,10 +12,8 @@ from equal_models import SCALE, same
 from mipmap_plugin.adaptation.optimization.checks import checks_until, is_checked
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.run import Run
-from mipmap_plugin.adaptation.optimization.validation import (
-    HARM_DB,
-    Steering,
-)
+from mipmap_plugin.adaptation.optimization.steering import Steering
+from mipmap_plugin.adaptation.optimization.validation import HARM_DB
 from mipmap_plugin.adaptation.renderers import Renderer
 from mipmap_plugin.adaptation.start import candidates as start
 from mipmap_plugin.adaptation.target.resize import resize

@@ -68,8 +68,10 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
 
 def _no_time_for_truths(run: Run, config: AdaptConfig, order: ViewSchedule) -> End | None:
     """Why there is no next step, where the truths that it needs anew are expected to take longer than is left: large ones take seconds."""
-    known, views = run.costs.truths, order(run.step, run.progress(config)) if run.step < config.steps else []
-    takes = sum(view not in known for view in views) * sum(known.values()) / max(1, len(known))
+    if config.time_budget_s is None or run.step >= config.steps:
+        return None
+    known = run.costs.truths
+    takes = sum(view not in known for view in order(run.step, run.progress(config))) * sum(known.values()) / max(1, len(known))
     return End.TIME if takes > run.budget_left(config) else None
 
 

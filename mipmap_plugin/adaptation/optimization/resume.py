@@ -17,7 +17,7 @@ from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.run import Run, Task, Trial
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.adaptation.optimization.state_file import StateFile, claim_state_file
-from mipmap_plugin.adaptation.optimization.validation import Steering
+from mipmap_plugin.adaptation.optimization.steering import Steering
 from mipmap_plugin.adaptation.report import versions
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import CheckpointError, OutputError, SettingsError

@@ -20,7 +20,8 @@ from mipmap_plugin.adaptation.optimization.density import ScreenGradients
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.quickest import QuickestThreads
-from mipmap_plugin.adaptation.optimization.validation import Steering, Validation
+from mipmap_plugin.adaptation.optimization.steering import Steering
+from mipmap_plugin.adaptation.optimization.validation import Validation
 from mipmap_plugin.adaptation.pixel_size import pixel_size
 from mipmap_plugin.adaptation.renderers import SteppingRenderer, ViewsRenderer
 from mipmap_plugin.adaptation.target.resize import difference_from
