@@ -43,6 +43,7 @@ class StateKeeper:
     def __init__(self, path: Path | None, fingerprint: str) -> None:
         self._requested, self._fingerprint = path, fingerprint
         self.file: StateFile | None = None  # where this run saves its state
+        self._state: dict[str, Any] | None = None  # that was found there, until the run goes on from it
         self._saved_at, self._took = time.monotonic(), 0.0
 
     def start_or_resume(self, student: SplatModel, task: Task, config: AdaptConfig, spent: float) -> Run:
@@ -53,29 +54,29 @@ class StateKeeper:
         if self._requested is None:
             return Run.start(student, task, config, spent)
         refuse_output(self._requested, overwrite=True, is_file=True)
-        states: list[dict[str, Any]] = []
         try:
-            self.file = claim_state_file(self._requested, lambda path: self._whose(path, states))
+            self.file = claim_state_file(self._requested, self._whose)
         except OSError as error:
             warnings.warn(f"{self._requested} cannot be written ({error.strerror}), so that this run could not be resumed", stacklevel=2)
-        if not states:
+        state, self._state = self._state, None
+        if state is None:
             try:
                 return Run.start(student, task, config, spent)
             except BaseException:  # Ctrl-C too: its traceback would hold the lock, so that a folder without a state would stay
                 self._release()
                 raise
         try:
-            return load_run(states[0], student, config)
+            return load_run(state, student, config)
         except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-            if others := _of_another_version(states[0]):
+            if others := _of_another_version(state):
                 raise SettingsError(f"{self._path}: this state {others}, or delete it to start anew") from error
             raise SettingsError(f"{self._path}: this state of a run is incomplete; delete it to start anew ({error})") from error
 
-    def _whose(self, path: Path, states: list[dict[str, Any]]) -> str:
-        """Append the state in a file to `states` and return "" if it belongs to this run; else say whose it is, and what to do with it."""
+    def _whose(self, path: Path) -> str:
+        """Keep the state in a file and return "" if it belongs to this run; else say whose it is, and what to do with it."""
         state = _read(path)
         if isinstance(state, dict) and state.get("fingerprint") == self._fingerprint:
-            states.append(state)
+            self._state = state
             return ""
         return _of_another_version(state) or "belongs to another base, settings or views; repeat the run with those"
 

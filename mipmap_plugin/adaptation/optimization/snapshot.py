@@ -54,7 +54,8 @@ class Snapshot:
         parameters = model.parameters()
         # A GPU sums blend weights in any order, so that merging again may leave another number of splats than a saved run has.
         if anew or len(parameters["means"]) != len(self.rows["means"]):
-            model.replace_parameters(neighbors({name: tensor.clone().requires_grad_() for name, tensor in self.rows.items()}))
+            rows = neighbors({name: tensor.clone() for name, tensor in self.rows.items()})
+            model.replace_parameters({name: tensor.requires_grad_() for name, tensor in rows.items()})
         else:
             for name, tensor in parameters.items():
                 tensor.copy_(self.rows[name])
