@@ -17,7 +17,7 @@ from mipmap_plugin.camera import Camera
 Halves = int | tuple[Any, Any]
 
 
-def places(views: Sequence[Camera]) -> Tensor:
+def poses(views: Sequence[Camera]) -> Tensor:
     """What tells views apart, [V, 6] float64: where they are, in units of their mean distance from the middle, and where they look."""
     centers = torch.stack([view.center for view in views])
     offsets = centers - centers.mean(0)
@@ -26,7 +26,7 @@ def places(views: Sequence[Camera]) -> Tensor:
 
 
 def halves_of(members: Sequence[int], at: Tensor) -> Halves:
-    """The `members`, one or more, at the places `at` [V, 6], cut where they are most spread out."""
+    """The `members`, one or more, with the poses `at` [V, 6], cut where they are most spread out."""
     if len(members) < 2:
         return members[0]
     rows = at[list(members)]

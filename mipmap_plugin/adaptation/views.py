@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import torch
 
-from mipmap_plugin.adaptation.spreading import halves_of, places, spread
+from mipmap_plugin.adaptation.spreading import halves_of, poses, spread
 from mipmap_plugin.adaptation.viewpoints import Viewpoints
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
@@ -76,7 +76,7 @@ class Rounds:
     def __init__(self, views: Sequence[Camera], seed: int, *, spread_out: bool = False) -> None:
         """`spread_out`: neighbors look from all sides; otherwise the order is shuffled."""
         self.views, self._seed = list(views), seed
-        self._halves = halves_of(range(len(views)), places(views)) if spread_out and views else None
+        self._halves = halves_of(range(len(views)), poses(views)) if spread_out and views else None
         self._round = -1
         self._order: list[int] = []
 
@@ -84,14 +84,10 @@ class Rounds:
         """The `draw`-th view since the beginning of the run."""
         round_number, position = divmod(draw, len(self.views))
         if round_number != self._round:
-            self._round, self._order = round_number, self._order_of(round_number)
+            generator = torch.Generator().manual_seed(derived_seed(self._seed, round_number))
+            order = torch.randperm(len(self.views), generator=generator).tolist() if self._halves is None else spread(self._halves, generator)
+            self._round, self._order = round_number, order
         return self.views[self._order[position]]
-
-    def _order_of(self, round_number: int) -> list[int]:
-        generator = torch.Generator().manual_seed(derived_seed(self._seed, round_number))
-        if self._halves is not None:
-            return spread(self._halves, generator)
-        return torch.randperm(len(self.views), generator=generator).tolist()
 
 
 def extent(views: Sequence[Camera]) -> float:

@@ -22,13 +22,13 @@ from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.quickest import QuickestThreads
 from mipmap_plugin.adaptation.optimization.steering import Steering
 from mipmap_plugin.adaptation.optimization.validation import Validation
-from mipmap_plugin.adaptation.pixel_size import pixel_size
+from mipmap_plugin.adaptation.pixel_size import target_pixel
 from mipmap_plugin.adaptation.renderers import SteppingRenderer, ViewsRenderer
 from mipmap_plugin.adaptation.target.resize import difference_from
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import SplatModel, count_of, places
+from mipmap_plugin.models.base import SplatModel, count_of
 
 # Number of views on which a student is compared with the base to assess a growth.
 AGREEMENT_VIEWS = 8
@@ -72,8 +72,8 @@ class Task:
         return count_of(model, self.views[0], self.scale)
 
     def pixel(self, model: SplatModel) -> float:
-        """The size of a target pixel at the median splat of a model, in world units."""
-        return float(pixel_size(places(model, self.views[0]), self.views).median()) / self.scale
+        """The size of a pixel in world units, by which the means move."""
+        return target_pixel(model, self.views, self.scale)
 
     @torch.no_grad()
     def agreement(self, student: SplatModel, config: AdaptConfig) -> float:
