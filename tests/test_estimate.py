@@ -15,8 +15,8 @@ from mipmap_plugin.adaptation.optimization.estimate import Forecast
 from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
+from mipmap_plugin.adaptation.schedule import ViewSchedule
 from mipmap_plugin.adaptation.target.resize import resize
-from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.models import load_model

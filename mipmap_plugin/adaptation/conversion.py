@@ -18,9 +18,8 @@ from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import count_of_views
 from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer
-from mipmap_plugin.adaptation.seeing import seeing
 from mipmap_plugin.adaptation.session import Session
-from mipmap_plugin.adaptation.shown import orbited
+from mipmap_plugin.adaptation.shown import orbited, seeing
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.warn import warn

@@ -31,9 +31,8 @@ from mipmap_plugin.process.freed_memory import return_freed_memory
 from mipmap_plugin.progress import announced, counted
 from mipmap_plugin.tiles.folder import START, halo_file, layer_file, part_file, run_file, steered_file, truth_file, work_folder
 from mipmap_plugin.tiles.job import TileJob, Work
-from mipmap_plugin.tiles.judge import JOINED, judged
 from mipmap_plugin.tiles.plan import alone, claim, cut_for, refuse
-from mipmap_plugin.tiles.report import make_report
+from mipmap_plugin.tiles.report import JOINED, judged, make_report
 from mipmap_plugin.tiles.scene import TiledScene, close_opened, opened
 from mipmap_plugin.tiles.steering import Steered, open_state, result, sweep_of
 from mipmap_plugin.tiles.sweeps import Sweep

@@ -11,7 +11,7 @@ import torch
 from cut_scenes import config, cut_in_three
 
 from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS
-from mipmap_plugin.adaptation.views import ViewSchedule
+from mipmap_plugin.adaptation.schedule import ViewSchedule
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel

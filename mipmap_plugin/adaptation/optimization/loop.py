@@ -11,15 +11,15 @@ from mipmap_plugin.adaptation.optimization import density
 from mipmap_plugin.adaptation.optimization.activation import Activation
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.checks import check, check_again, is_checked
-from mipmap_plugin.adaptation.optimization.comparing import compare
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.estimate import StepsBar
 from mipmap_plugin.adaptation.optimization.growing import control_density, frozen_parameters, undo_harmful_growth
 from mipmap_plugin.adaptation.optimization.interrupt import interruptible
+from mipmap_plugin.adaptation.optimization.losses import compare
 from mipmap_plugin.adaptation.optimization.optimizer import set_rates
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.parallel import large_for_torch, max_threads, together, views_at_once
-from mipmap_plugin.adaptation.views import ViewSchedule
+from mipmap_plugin.adaptation.schedule import ViewSchedule
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.process.threads import side_by_side
@@ -102,7 +102,7 @@ def _step_by_rows(run: Run, rows: ByRows, task: Task, config: AdaptConfig, views
     def compared(numbers: Sequence[int], xs: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:  # x: the student
         some = [views[number] for number in numbers]
         targets = [run.costs.truth(view, task.truth) for view in some]  # r(x̂): the frozen base, resized
-        return compare(task, config, some, xs, targets)
+        return compare(some, xs, targets, config, task.scale, task.detail)
 
     square_errors = rows.differentiate([task.cameras[view] for view in views], run.step * config.views_per_step, compared)
     run.square_error = run.square_error + torch.stack(square_errors).mean()
@@ -123,7 +123,7 @@ def _step_by_autograd(run: Run, task: Task, config: AdaptConfig, views: Sequence
         targets = [run.costs.truth(view, task.truth) for view in some]
         gaussians = splats(cameras[some[0]])
         images = task.images(gaussians, [cameras[view] for view in some], run.step * config.views_per_step + number)
-        compared = compare(task, config, some, images, targets)
+        compared = compare(some, images, targets, config, task.scale, task.detail)
         torch.autograd.backward(images, [gradient for gradient, _ in compared])
         run.square_error = run.square_error + sum(square_error for _, square_error in compared) / len(views)
         if run.gradients is not None:

@@ -18,6 +18,7 @@ from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.costs import Costs
 from mipmap_plugin.adaptation.optimization.density import ScreenGradients
 from mipmap_plugin.adaptation.optimization.ending import End
+from mipmap_plugin.adaptation.optimization.losses import Detail
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.quickest import QuickestThreads
 from mipmap_plugin.adaptation.optimization.steering import Steering
@@ -44,7 +45,7 @@ class Task:
     renders: Sequence[Callable[[Gaussians, Camera], Tensor]]  # splats and a camera of the new scale -> [h, w, 3]; of each viewer they are adapted for
     white_background: bool
     validation: Validation
-    detail: Callable[[Camera, Tensor], Tensor] | None = None  # a view and its image -> a further part of the loss
+    detail: Detail | None = None  # of a zoom-in with an upsampler
     max_splats: int = sys.maxsize  # growing stops at this number
     render_views: ViewsRenderer | None = None  # the same in one call, if the backend can
     render_to_step: SteppingRenderer | None = None  # the same if the backend can move the splats itself

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.spreading import halves_of, poses, spread
+from mipmap_plugin.adaptation.schedule import halves_of, poses, spread
 from mipmap_plugin.adaptation.target.image_store import moved_off_full_gpu
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.structure import similarity
