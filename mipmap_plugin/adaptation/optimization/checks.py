@@ -34,7 +34,6 @@ def checks_until(config: AdaptConfig, step: int) -> int:
 
 
 def _steps_between(config: AdaptConfig, *, warming_up: bool) -> int:
-    """The number of steps between two checks."""
     every = math.ceil(config.warm_up_steps / CHECKS_IN_WARM_UP) if warming_up else max(STEPS_BETWEEN, config.steps // CHECKS)
     return max(1, min(every, config.check_every))
 
