@@ -75,6 +75,10 @@ class Stages:
         cameras = self.cameras if base.traits.moves else seeing(self.cameras, base.parameters()["means"], near)
         if first is None:
             return Session(self.request, scale, config, cameras, self.photographs).run(self.resume, self.observe)
+        return self._in_two(scale, config, first, cameras)
+
+    def _in_two(self, scale: float, config: AdaptConfig, first: AdaptConfig, cameras: list[Camera]) -> Adapted:
+        """Convert the base with the settings `first`, and adapt what that returns to `scale`."""
         session = Session(self.request, 1.0, first, cameras, None)
         session.wanted = scale
         converted = replace(session.run(self.resume and conversion_state(self.resume), self.observe), judge=None)  # which nobody saves
