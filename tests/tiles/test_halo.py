@@ -88,7 +88,7 @@ def test_all_tiles_together_are_asked_to_mend_the_whole_error(halved):
     asked = torch.zeros(*size, 3)
     for halo in around:
         crop = halo.crop(view)
-        left, top, right, bottom = halo._box(view.name)
+        left, top, right, bottom = halo._halos.box(f"{view.name}/{halo._number}")
         asked[top:bottom, left:right] += halo.wanted(crop) - image[top:bottom, left:right]
     assert error.abs().max() > 0.1
     middle = (slice(2, 6), slice(3, 7))
