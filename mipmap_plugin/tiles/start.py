@@ -111,7 +111,7 @@ class StartSearch:
         """Write a core's candidate; returns its blend weights, and those that it had if nothing hid it."""
         scene = self.scene
         model = scene.for_target(scene.base.parameters(core))
-        found = [weights[core], torch.empty(0)]
+        own, whole = weights[core], torch.empty(0)
 
         def sizes(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
             """Of a base pixel at each splat, and of the splat's weight if nothing hid it."""
@@ -119,13 +119,15 @@ class StartSearch:
             return pixel, whole_weights(gaussians, pixel, scene.views.adapted, scene.base_effects, scene.scale)
 
         def merged(gaussians: Gaussians) -> Gaussians:
-            pixel, whole = sizes(gaussians)
-            seen = may_show(weights[core], whole, gaussians.means, scene.views.adapted, self.views)
-            splats, found[0] = merge_seen(gaussians, pixel / scene.scale, weights[core], fraction, seen)
+            nonlocal own
+            pixel, before = sizes(gaussians)
+            seen = may_show(own, before, gaussians.means, scene.views.adapted, self.views)
+            splats, own = merge_seen(gaussians, pixel / scene.scale, own, fraction, seen)
             return splats
 
         def formed(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
-            pixel, found[1] = sizes(gaussians)
+            nonlocal whole
+            pixel, whole = sizes(gaussians)
             known = pixel if scene.scale <= 1 else None
             form = FormSettings(1.0 if self.matches else AREA_POWER, scene.config.crispness, len(self.views), known)
             return closed_form(gaussians, scene.views.adapted, scene.scale, scene.base_effects, scene.target, form)
@@ -135,7 +137,7 @@ class StartSearch:
         if self.forms:
             model.reshape(formed)
         write_store(file, model.parameters())
-        return found[0], found[1]
+        return own, whole
 
     def _match(self, name: str, wanted: Tensor, whole: Tensor) -> None:
         """Give the splats opacities with which they have the `wanted` blend weights [N] (`start.matching`), and write them again.

@@ -54,8 +54,9 @@ class Snapshot:
         parameters = model.parameters()
         # A GPU sums blend weights in any order, so that merging again may leave another number of splats than a saved run has.
         if anew or len(parameters["means"]) != len(self.rows["means"]):
-            rows = neighbors({name: tensor.clone() for name, tensor in self.rows.items()})
-            model.replace_parameters({name: tensor.requires_grad_() for name, tensor in rows.items()})
+            copies = neighbors(self.rows)  # of colors, which are most of the memory
+            copies |= {name: tensor.clone() for name, tensor in self.rows.items() if copies[name] is tensor}
+            model.replace_parameters({name: tensor.requires_grad_() for name, tensor in copies.items()})
         else:
             for name, tensor in parameters.items():
                 tensor.copy_(self.rows[name])
