@@ -1,4 +1,8 @@
-"""Algorithm 1 of Mipmap-GS: optimize the splats against the images of the frozen base, resized to the new scale."""
+"""Algorithm 1 of Mipmap-GS: optimize the splats against the images of the frozen base, resized to the new scale.
+
+`adapt` repeats: choose views, make r(x̂) of those that have none yet, take a step, and check the splats on other views. A step draws x, compares it
+with r(x̂), goes backward and moves the splats; every some steps it prunes and densifies.
+"""
 
 from __future__ import annotations
 
@@ -64,15 +68,6 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
         if interrupted():
             on_interrupt(run)
     return reason or End.STEPS
-
-
-def _no_time_for_truths(run: Run, config: AdaptConfig, order: ViewSchedule) -> End | None:
-    """Why there is no next step, where the truths that it needs anew are expected to take longer than is left: large ones take seconds."""
-    if config.time_budget_s is None or run.step >= config.steps:
-        return None
-    known = run.costs.truths
-    takes = sum(view not in known for view in order(run.step, run.progress(config))) * sum(known.values()) / max(1, len(known))
-    return End.TIME if takes > run.budget_left(config) else None
 
 
 # docs/how_it_works.md shows the code up to the next such line.
@@ -154,3 +149,12 @@ def _make_truths(run: Run, task: Task, config: AdaptConfig, order: ViewSchedule,
         run.costs.prepare(new, prepare)
     else:
         list(side_by_side(lambda view: run.costs.truth(view, task.truth), new, at_once))
+
+
+def _no_time_for_truths(run: Run, config: AdaptConfig, order: ViewSchedule) -> End | None:
+    """Why there is no next step, where the truths that it needs anew are expected to take longer than is left: large ones take seconds."""
+    if config.time_budget_s is None or run.step >= config.steps:
+        return None
+    known = run.costs.truths
+    takes = sum(view not in known for view in order(run.step, run.progress(config))) * sum(known.values()) / max(1, len(known))
+    return End.TIME if takes > run.budget_left(config) else None
