@@ -76,12 +76,8 @@ class Painter:
         """The picture [H, W, 3] of all splats in front of the background."""
         return self.draw(splats, camera).over(torch.tensor(self.effects.background))
 
-    def blend_weights(self, splats: Splats, cameras: Sequence[Camera]) -> Tensor:
-        """The mean blend weight [N] of each splat over views, in pixels (`start.blend_weights`, for splats on the disk)."""
-        return self.weighed(splats, cameras)[0]
-
     def weighed(self, splats: Splats, cameras: Sequence[Camera]) -> tuple[Tensor, float]:
-        """`blend_weights`, and the fraction of the splats that a view shows, mean over views; what is hidden behind others does not count."""
+        """`blend_weights.weighed` of splats on the disk: the mean blend weight [N] of each over views, px, and the fraction that a view shows."""
         total, shown = torch.zeros(len(splats)), 0.0
         for view in cameras:
             weights = torch.zeros(len(splats))

@@ -65,7 +65,7 @@ class StartSearch:
         weights, shown = painter.weighed(scene.base, first)
         self.views = evenly(scene.views.adapted, views_for(shown))
         if further := [view for view in self.views if view not in first]:
-            weights = weights.lerp(painter.blend_weights(scene.base, further), len(further) / (len(first) + len(further)))
+            weights = weights.lerp(painter.weighed(scene.base, further)[0], len(further) / (len(first) + len(further)))
         return weights * scene.scale**2
 
     def _takes_merged(self, weights: Tensor, formed_db: float, base_db: float) -> bool:
@@ -150,7 +150,7 @@ class StartSearch:
 
         def weights_of(opacities: Tensor) -> Tensor:
             splats.opacities = opacities
-            return painter.blend_weights(splats, views)
+            return painter.weighed(splats, views)[0]
 
         opacities = torch.cat([part.shapes[:, -1] for part in splats.parts]).sigmoid()
         splats.release()
@@ -178,5 +178,5 @@ class StartSearch:
 def psnr(scene: TiledScene, splats: Splats, truths: Truths, views: Any) -> float:
     """The mean PSNR (dB) of splats as the target shows them over views, of images and truths clamped as a display does (`validation.mean_db`)."""
     painter = scene.painter(scene.target)
-    images = ((painter.image(splats, view.zoomed(scene.scale)), truths(view)) for view in views)
+    images = ((painter.image(splats, view.zoomed(scene.scale)), truths[view.name]) for view in views)
     return mean_db([float((image.clamp(0, 1) - truth.clamp(0, 1)).square().mean()) for image, truth in images])

@@ -79,7 +79,7 @@ class Surroundings:
         own = f"{name}/{self._number}"
         through, behind, share = (self._halos[own].float() / FINE).split((1, 3, 1), dim=2)
         left, top, right, bottom = box = self._halos.box(own)
-        image, truth = within(from_16_bits(self._halos[name]), box), within(self._truths.named(name), box)
+        image, truth = within(from_16_bits(self._halos[name]), box), within(self._truths[name], box)
         x, y, *_ = self._layers.box(name)
         before = within(self._layers[name], (left - x, top - y, right - x, bottom - y)).float()
         core = through * before[..., :3] + before[..., 3:] * behind

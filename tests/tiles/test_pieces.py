@@ -159,10 +159,10 @@ def test_slabs_give_the_blend_weights_of_all_splats(on_disk, monkeypatch):
 def test_strips_give_the_blend_weights_of_their_view(on_disk, monkeypatch):
     splats, _ = on_disk
     view, painter = tiny.cameras(1), Painter(ReferenceBackend(), EFFECTS)
-    whole = painter.blend_weights(splats, view)
+    whole, _ = painter.weighed(splats, view)
     monkeypatch.setattr(slabs, "MOST_PIXELS", 300)
     assert [strip.height for strip in slabs.strips(view[0])] == [8, 8, 8]
-    assert torch.allclose(painter.blend_weights(splats, view), whole, atol=0.02, rtol=0.01)  # the frame limits how oblique a splat may be drawn
+    assert torch.allclose(painter.weighed(splats, view)[0], whole, atol=0.02, rtol=0.01)  # the frame limits how oblique a splat may be drawn
 
 
 def test_a_plain_text_file_is_refused(tmp_path):

@@ -58,15 +58,11 @@ class Task:
         """The camera of the new scale of each view."""
         return {view: view.zoomed(self.scale) for view in self.views}
 
-    def renderer(self, draw: int) -> Callable[[Gaussians, Camera], Tensor]:
-        """The function that renders the `draw`-th view since the beginning: the viewers take turns."""
-        return self.renders[draw % len(self.renders)]
-
     def images(self, gaussians: Gaussians, cameras: Sequence[Camera], draw: int) -> list[Tensor]:
-        """The images [h, w, 3] of the `draw`-th view since the beginning and of those after it."""
+        """The images [h, w, 3] of the `draw`-th view since the beginning and of those after it: the viewers take turns."""
         if self.render_views is not None:
             return self.render_views(gaussians, cameras, draw)
-        return [self.renderer(draw + number)(gaussians, camera) for number, camera in enumerate(cameras)]
+        return [self.renders[(draw + number) % len(self.renders)](gaussians, camera) for number, camera in enumerate(cameras)]
 
     def count(self, model: SplatModel) -> int:
         """The number of splats that the first view shows at the new scale."""
