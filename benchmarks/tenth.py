@@ -27,8 +27,9 @@ PARTS = {"a twentieth": 1 / 20, "a tenth": 1 / 10, "a fifth": 1 / 5}
 INTRO = """# A tenth of the time
 
 Made by `python benchmarks/tenth.py DATA`: `paper` to its end, and `default` with parts of the seconds that it took. Protocol P3, mean of
-the test views, all held out; one thread of a shared machine, one after the other. The seconds are those of the whole, with merging, the closed form and validation. A run
-ends with the step and the check in which its part is used up, and where the start alone takes longer, that is judged.
+the test views, all held out; one thread of a shared machine, one after the other. The seconds are those of the whole, with merging, the
+closed form and validation. A run ends with the step and the check in which its part is used up, and where the start alone takes longer,
+that is judged.
 """
 
 

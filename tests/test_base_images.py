@@ -20,13 +20,13 @@ TRAINED = Effects(sh_degree=1)
 @pytest.fixture
 def drawn(monkeypatch):
     """The poses and sizes of all base images that are drawn."""
-    seen, render = [], BaseImages._render
+    seen, draw = [], BaseImages._drawn
 
-    def noted(self, view, fraction):
-        seen.append((view.viewmat.numpy().tobytes(), view.size, fraction))
-        return render(self, view, fraction)
+    def noted(self, views, fraction):
+        seen.extend((view.viewmat.numpy().tobytes(), view.size, fraction) for view in views)
+        return draw(self, views, fraction)
 
-    monkeypatch.setattr(BaseImages, "_render", noted)
+    monkeypatch.setattr(BaseImages, "_drawn", noted)
     return seen
 
 

@@ -16,7 +16,8 @@ from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.run import Run, Task
-from mipmap_plugin.adaptation.optimization.validation import Steering, Validation, no_validation
+from mipmap_plugin.adaptation.optimization.steering import Steering
+from mipmap_plugin.adaptation.optimization.validation import Validation, no_validation
 from mipmap_plugin.recipes import recipe
 
 STILL = Following()

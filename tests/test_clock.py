@@ -8,7 +8,7 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.optimization.estimate import Costs
+from mipmap_plugin.adaptation.optimization.costs import Costs
 from mipmap_plugin.adaptation.start import clock as clock_module
 from mipmap_plugin.adaptation.start.clock import Clock
 from mipmap_plugin.process.clock import now

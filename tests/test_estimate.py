@@ -2,7 +2,6 @@
 
 import time
 from dataclasses import replace
-from functools import partial
 from types import SimpleNamespace
 
 import moving
@@ -11,12 +10,13 @@ import tiny
 
 from mipmap_plugin.adaptation.following import Following
 from mipmap_plugin.adaptation.optimization import loop
-from mipmap_plugin.adaptation.optimization.estimate import Costs, Forecast
+from mipmap_plugin.adaptation.optimization.costs import Costs
+from mipmap_plugin.adaptation.optimization.estimate import Forecast
 from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
+from mipmap_plugin.adaptation.schedule import ViewSchedule
 from mipmap_plugin.adaptation.target.resize import resize
-from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.models import load_model
@@ -92,18 +92,18 @@ def test_evaluations_of_a_field_are_foretold_as_rates_fall(clock, monkeypatch, t
 def test_slow_first_steps_are_soon_forgotten():
     """Memory, caches and threads have to be found for them."""
     views, config = tiny.cameras(4), recipe("default", SCALE, steps=40, views_per_step=2, warm_up=0)
-    forecast = Forecast(ViewSchedule(views, config), config, lambda step: 0, Evaluations(Following(), config))
+    forecast = Forecast(ViewSchedule(views, config), config, Evaluations(Following(), config))
     costs = Costs(truths=dict.fromkeys(views, 0.0))
     seconds = [5.0 + 0.1 * step for step in range(1, 41)]  # the first takes 50 times as long
-    left = [forecast.left(step, spent, costs) for step, spent in enumerate(seconds, start=1)]
+    left = [forecast.left(step, spent, costs, 1.0) for step, spent in enumerate(seconds, start=1)]
     assert left[0] > 100 and left[3] == pytest.approx(36 * 0.1) and left[-1] == 0
 
 
 def test_a_run_of_millions_of_steps_that_a_budget_ends_begins_at_once():
     views, config = tiny.cameras(4), recipe("default", SCALE, steps=3 * 10**6, views_per_step=3)
     began = time.perf_counter()
-    forecast = Forecast(ViewSchedule(views, config), config, partial(loop.checks_until, config), Evaluations(Following(), config))
-    assert forecast.left(10, 1.0, Costs(truths=dict.fromkeys(views, 0.0))) > 0 and time.perf_counter() - began < 0.5
+    forecast = Forecast(ViewSchedule(views, config), config, Evaluations(Following(), config))
+    assert forecast.left(10, 1.0, Costs(truths=dict.fromkeys(views, 0.0)), 1.0) > 0 and time.perf_counter() - began < 0.5
 
 
 def test_a_budget_bounds_the_estimate(clock, monkeypatch):

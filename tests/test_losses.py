@@ -1,13 +1,10 @@
 """The gradients of losses, against autograd's of their definitions."""
 
-from types import SimpleNamespace
-
 import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.optimization.loop import _compare_all
-from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR, gradient_of
+from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR, compare, gradient_of
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
@@ -56,6 +53,6 @@ def test_steps_leave_what_a_display_cannot_show(scale):
 @pytest.mark.parametrize(("shown", "truth", "excess"), [(3.0, 0.9, 0.12), (3.0, 1.0, 0.02), (3.0, 1.07, 0.02), (1.06, 1.07, -0.01), (0.5, 1.0, -0.5)])
 def test_an_image_is_not_made_brighter_than_a_truth_that_is_brighter_than_white(shown, truth, excess):
     """As a bicubic filter makes truths beside edges. An image that counted as at most 1.02 there was made brighter without end."""
-    task, config = SimpleNamespace(scale=1 / 4, detail=None), AdaptConfig(loss="psnr")
-    [(gradient, square_error)] = _compare_all(task, config, [None], [torch.full((2, 2, 3), shown)], [torch.full((2, 2, 3), truth)])
+    image, target = (torch.full((2, 2, 3), color) for color in (shown, truth))
+    [(gradient, square_error)] = compare([None], [image], [target], AdaptConfig(loss="psnr"), 1 / 4, None)
     assert bool((gradient.sign() == torch.tensor(excess).sign()).all()) and float(square_error) == pytest.approx(excess**2, rel=1e-3)

@@ -12,7 +12,7 @@ import tiny
 import torch
 
 from mipmap_plugin.adaptation.following import Following, release
-from mipmap_plugin.adaptation.moments import at_moments, evaluate_moments, sharing_moments
+from mipmap_plugin.adaptation.moments import at_moments, at_their_moments, evaluate_moments
 from mipmap_plugin.adaptation.start.candidates import StartSearch
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import Traits
@@ -199,12 +199,12 @@ def test_views_are_at_the_nearest_of_few_moments():
 
 def test_views_that_choose_have_moments_of_their_own():
     views, validation = at_times(30), [replace(view, time=0.01 + 0.03 * number) for number, view in enumerate(tiny.cameras(24))]
-    used, both, note = sharing_moments(views, validation, 6)
+    used, both, note = at_their_moments(views, validation, 6, seed=0)
     moments = {view.time for view in used}
-    assert len(moments) <= 6 and {view.time for view in both[::2]} <= moments and note == ", each at the nearest of 6 moments"
+    assert len(moments) <= 6 and {view.time for view in both[::2]} <= moments and note == "at their own times, each at the nearest of 6 moments"
     own = {view.time for view in both[1::2]}
     assert len(own) <= 6 and own <= {view.time for view in validation[1::2]}
-    assert sharing_moments(views, validation, None)[::2] == (views, "")
+    assert at_their_moments(views, validation, None, seed=0)[::2] == (views, "at their own times")
 
 
 def test_the_published_recipe_takes_each_view_at_its_own_time():

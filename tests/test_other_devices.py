@@ -17,7 +17,7 @@ import torch_checkpoints
 
 from mipmap_plugin import load_model, load_scene, wrap_model
 from mipmap_plugin.adaptation.optimization import run
-from mipmap_plugin.adaptation.optimization.loop import _compare_all
+from mipmap_plugin.adaptation.optimization.losses import compare
 from mipmap_plugin.adaptation.optimization.validation import Validation
 from mipmap_plugin.adaptation.pixel_size import mean_pixel_size
 from mipmap_plugin.adaptation.shown import remarks, showing
@@ -206,13 +206,13 @@ def test_views_are_looked_at_together_there():
 
 @pytest.mark.parametrize("scale", [1 / 4, 2])
 def test_images_of_a_step_are_compared_together_there(scale):
-    task, config = SimpleNamespace(scale=scale, detail=None), AdaptConfig(loss="psnr", compare_at="base")
+    config = AdaptConfig(loss="psnr", compare_at="base")
 
-    def compare(splats, count):
+    def compared(splats, count):
         image, truth = splats.means[None], splats.scales[None]  # as [h, w, 3]
-        _compare_all(task, config, [None] * count, [image] * count, [truth] * count)
+        compare([None] * count, [image] * count, [truth] * count, config, scale, None)
 
-    few, many = (cost(lambda splats, count=count: compare(splats, count)) for count in (2, 5))
+    few, many = (cost(lambda splats, count=count: compared(splats, count)) for count in (2, 5))
     assert few == many
 
 

@@ -7,12 +7,13 @@ import tiny
 import torch
 
 from mipmap_plugin.adaptation import views as views_module
+from mipmap_plugin.adaptation.schedule import Rounds, ViewSchedule
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
 from mipmap_plugin.adaptation.viewpoints import Viewpoints
-from mipmap_plugin.adaptation.views import Rounds, ViewSchedule, choose_views, extent
+from mipmap_plugin.adaptation.views import choose_views, extent
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.config import AdaptConfig

@@ -3,7 +3,7 @@
 import pytest
 
 from mipmap_plugin.adaptation.optimization import quickest
-from mipmap_plugin.adaptation.optimization.estimate import Costs
+from mipmap_plugin.adaptation.optimization.costs import Costs
 from mipmap_plugin.adaptation.optimization.quickest import FIRST_INTERVAL, TRIED, QuickestThreads
 from mipmap_plugin.process import threads
 

@@ -7,7 +7,7 @@ import torch
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation.optimization import validation
-from mipmap_plugin.adaptation.optimization.estimate import Costs
+from mipmap_plugin.adaptation.optimization.costs import Costs
 from mipmap_plugin.adaptation.optimization.validation import Validation
 from mipmap_plugin.adaptation.parallel import ROWS_OF_VIEWS, together
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer

@@ -18,9 +18,8 @@ from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import count_of_views
 from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer
-from mipmap_plugin.adaptation.seeing import seeing
 from mipmap_plugin.adaptation.session import Session
-from mipmap_plugin.adaptation.shown import orbited
+from mipmap_plugin.adaptation.shown import orbited, seeing
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.warn import warn
@@ -76,6 +75,10 @@ class Stages:
         cameras = self.cameras if base.traits.moves else seeing(self.cameras, base.parameters()["means"], near)
         if first is None:
             return Session(self.request, scale, config, cameras, self.photographs).run(self.resume, self.observe)
+        return self._in_two(scale, config, first, cameras)
+
+    def _in_two(self, scale: float, config: AdaptConfig, first: AdaptConfig, cameras: list[Camera]) -> Adapted:
+        """Convert the base with the settings `first`, and adapt what that returns to `scale`."""
         session = Session(self.request, 1.0, first, cameras, None)
         session.wanted = scale
         converted = replace(session.run(self.resume and conversion_state(self.resume), self.observe), judge=None)  # which nobody saves
@@ -91,7 +94,7 @@ class Stages:
 
     def _further(self, first: Report) -> Observer | None:
         """The observer of the second stage, whose steps and seconds are counted on from those of the first."""
-        observe, steps, spent = self.observe, _steps(first), first.seconds["total"]
+        observe, steps, spent = self.observe, first.curve[-1].step, first.seconds["total"]
         if observe is None:
             return None
         return lambda step, seconds, render: step > 0 and observe(step + steps, seconds + spent, render)
@@ -113,10 +116,6 @@ def _kept_if_interrupted(states: Sequence[StateFile]) -> Iterator[None]:
         raise
 
 
-def _steps(report: Report) -> int:
-    return report.curve[-1].step
-
-
 def _half(config: AdaptConfig) -> float | None:
     """The seconds that each stage may take."""
     return config.time_budget_s and SHARE * config.time_budget_s
@@ -124,10 +123,10 @@ def _half(config: AdaptConfig) -> float | None:
 
 def _joined(first: Report, second: Report, stopped: bool) -> Report:
     """The second stage's report, which tells of the first one too. `stopped`: the observer ended that."""
-    spent = first.seconds["total"]
+    spent, steps = first.seconds["total"], plural(first.curve[-1].step, "step")
     seconds = {"conversion": spent, **second.seconds, "total": second.seconds["total"] + spent}
     curve = [point.model_copy(update={"seconds": point.seconds + spent}) for point in second.curve]
-    told = f"converted at x1 before, {first.gain()}, in {plural(_steps(first), 'step')}{f', ended by {End.OBSERVER.value}' if stopped else ''}"
+    told = f"converted at x1 before, {first.gain()}, in {steps}{f', ended by {End.OBSERVER.value}' if stopped else ''}"
     peaks = [peak for peak in (first.peak_memory_mib, second.peak_memory_mib) if peak is not None]
     notes = [*dict.fromkeys([*first.notes, *second.notes]), told]
     changes = {"seconds": seconds, "curve": curve, "notes": notes, "peak_memory_mib": max(peaks, default=None)}

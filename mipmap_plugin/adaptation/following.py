@@ -7,9 +7,9 @@ from typing import Any
 
 from torch import Tensor
 
-from mipmap_plugin.adaptation.pixel_size import pixel_size
+from mipmap_plugin.adaptation.pixel_size import target_pixel
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.models.base import SplatModel, places
+from mipmap_plugin.models.base import SplatModel
 
 
 class Following:
@@ -24,7 +24,7 @@ class Following:
         self._whole = 0  # the whole part of `rounds`
         self._model: Any = None  # the model that is followed; it shares the results of evaluations with the base
         if base is not None and follows(base):
-            self._model, pixel = base, float(pixel_size(places(base, views[0]), views).median()) / scale
+            self._model, pixel = base, target_pixel(base, views, scale)
             self._times, self._distance = {view.time for view in views}, self._model.reach(pixel)
             self.reach, self.moments = self._distance / pixel, len(self._times)
 

@@ -13,7 +13,6 @@ import torch
 from mipmap_plugin.adaptation.following import follows
 from mipmap_plugin.adaptation.views import with_times
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.models.base import SplatModel
 
 # The most moments at which states are compared at the end: the field is evaluated anew at each, for each state.
@@ -35,26 +34,19 @@ def at_moments(views: Sequence[Camera], most: int | None) -> list[Camera]:
     return [replace(view, time=nearest[view.time or 0.0]) for view in views]
 
 
-def sharing_moments(views: Sequence[Camera], validation: Sequence[Camera], most: int | None) -> tuple[list[Camera], list[Camera], str]:
-    """The views and the validation views, of which every second one steers, at `most` moments or fewer, and a description of these moments.
+def at_their_moments(
+    views: Sequence[Camera], validation: Sequence[Camera], most: int | None, seed: int
+) -> tuple[list[Camera], list[Camera], str]:
+    """The views and the validation views, of which every second one steers, with their times, at `most` moments or fewer, and a note on these.
 
     The other validation views, which choose among the states at the end, have moments of their own, since they are held out.
     """
+    (views, times), (validation, _) = with_times(views, seed), with_times(validation, seed)
     used = at_moments([*views, *validation[::2]], most)
     steering, choosing = used[len(views) :], at_moments(validation[1::2], most and min(most, CHOOSING))
     before, after = (len({view.time for view in some}) for some in ([*views, *validation[::2]], used))
     paired = [view for view in chain(*zip_longest(steering, choosing)) if view is not None]
-    return used[: len(views)], paired, "" if after == before else f", each at the nearest of {after} moments"
-
-
-def at_their_moments(
-    views: Sequence[Camera], validation: Sequence[Camera], config: AdaptConfig, note: str
-) -> tuple[list[Camera], list[Camera], str]:
-    """The views and the validation views with their times, at as many moments as the settings allow; and the `note` on them with those."""
-    views, times = with_times(views, config.seed)
-    validation, _ = with_times(validation, config.seed)
-    views, validation, moments = sharing_moments(views, validation, config.moments)
-    return views, validation, f"{note}, {times}{moments}"
+    return used[: len(views)], paired, times if after == before else f"{times}, each at the nearest of {after} moments"
 
 
 @torch.no_grad()

@@ -59,23 +59,24 @@ class Session:
     state: StateFile | None = None  # of the run, as long as its model is not saved
     wanted: float | None = None  # where this is a conversion: the scale of the zoom-in that starts from what it returns; so its state is kept
 
-    def __init__(self, request: AdaptationRequest, scale: float, config: AdaptConfig, cameras: list[Camera], real: Photographs | None) -> None:
+    def __init__(self, request: AdaptationRequest, scale: float, config: AdaptConfig, cameras: list[Camera], photographs: Photographs | None) -> None:
         self.request, self.scale, self.targets, self.finer = request, scale, request.targets, request.finer
         self.base, self.backend, self.base_effects = request.images.model, request.images.backend, request.images.effects
         self.effects, self.extremes = next(iter(self.targets.values())), extreme_targets(self.targets)
         self.asked, self.config = config, affordable_for_model(config, self.base, cameras, self.effects.near_plane)
-        self.device = self.base.parameters()["means"].device
+        self._most_splats, self.device = config.most_splats or sys.maxsize, self.base.parameters()["means"].device
         self.viewpoints = replace(request.viewpoints, looks=looks_in_budget(self.config, self.base))
         self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.device)
-        self._has_photographs, self._orbits = real is not None, not cameras or config.views == "orbit"
+        self._has_photographs, self._orbits = photographs is not None, not cameras or config.views == "orbit"
         self.base_views, validation, self.views_note = self._choose_views(cameras)
         self.config = config = fitting(self.config, self.base_effects, self.base_views, scale)
         self.seconds["total"] = sum(self.seconds.values())
         self._closest_of = cameras if scale > 1 and cameras else self.base_views  # a zoom-in is as fine as what the base was seen from
-        self.views, self.views_note = over_band(self.base_views, config), self.views_note + (f", {real.note(self.base_views)}" if real else "")
+        self.views = over_band(self.base_views, config)
+        self.views_note += f", {photographs.note(self.base_views)}" if photographs else ""
         steering, choosing = (over_band(half, config) for half in (validation[::2], validation[1::2]))
         request.images.keep_only([*self.views, *steering, *choosing])
-        self.truth = PseudoTruth(request.images, scale, config, real)
+        self.truth = PseudoTruth(request.images, scale, config, photographs)
         self.detail = DetailLoss(self.truth, scale, config) if scale > 1 and config.compare_at == "both" and config.steps else None
         if self.detail is not None:
             self.views = evenly(self.views, min(config.upsampled_views, config.steps * config.views_per_step))
@@ -94,7 +95,8 @@ class Session:
             validation = shown
         if self.base.traits.moves:
             moments = None if self._has_photographs else affordable_moments(self.config, self.base)  # a photograph shows no moment but its own
-            views, validation, note = at_their_moments(views, validation, self.config.model_copy(update={"moments": moments}), note)
+            views, validation, times = at_their_moments(views, validation, moments, self.config.seed)
+            note += f", {times}"
         return views, validation, note
 
     def _looking(self) -> AbstractContextManager[None]:
@@ -245,10 +247,6 @@ class Session:
         """Whether the base is the answer as it is: at its own scale, where it is drawn as in its training, and no splats are too many."""
         few = len(self.base.parameters()["means"]) <= self._most_splats
         return self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values())
-
-    @property
-    def _most_splats(self) -> int:
-        return self.config.most_splats or sys.maxsize
 
     @property
     def _takes_steps(self) -> bool:

@@ -1,9 +1,10 @@
-"""What views show of a scene, and what is wrong with views that show nothing, only a speck, or what no single file suits."""
+"""What views show of a scene: those that see nothing of it, only a speck, or what no single file suits."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import compress
 from pathlib import Path
 from statistics import fmean
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB
 from mipmap_plugin.adaptation.parallel import in_batches
+from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import check_image
@@ -31,6 +33,12 @@ LOOKED_AT, TOO_MANY = 16, 0.05
 # A scene that no view shows larger than so many px, or than this fraction of a picture's shorter side, is too small to adapt. In views of an orbit it
 # fills nearly all of a picture, unless it has such small units that the near plane keeps cameras farther away than a user's.
 LEAST_PIXELS, LEAST_SHARE = 16, 0.25
+
+# How many splats are looked for in each round. Nearly every camera sees one of the first round's; only the others look for more.
+SAMPLES = 1 << 8, 1 << 14, 1 << 16
+
+# A camera counts as seeing a splat whose center lies in a frame this many times as large as its picture: splats reach into a picture from beside it.
+LARGER = 2
 
 # What to do about a scene in units so small that the near plane hides it.
 SCALE_UP = "scale the scene up, with its cameras if it has any"
@@ -67,6 +75,32 @@ def _inside(views: Sequence[Camera], means: Tensor, near: float) -> Iterator[Ten
     """Which `means` [N, 3] lie in the pictures of views, farther than the near plane: [V, N] bool for each batch of views."""
     for view in in_batches(views, means):
         yield view.in_picture(view.to_camera(means.detach()), near)
+
+
+def seeing(cameras: Sequence[Camera], means: Tensor, near: float) -> list[Camera]:
+    """The cameras that see something of splats at `means` [N, 3], with a warning of how many do not. `near`: the near plane, in world units.
+
+    Only some of many splats are looked for, so that a camera which sees a few of a million counts as blind. If none of the training's cameras
+    sees anything, all cameras are kept.
+    """
+    if len(cameras) < 2:
+        return list(cameras)
+    frames = {_larger(camera): camera for camera in cameras}  # of cameras that saw nothing so far
+    for most in SAMPLES:
+        for frame in showing(list(frames), means[:: max(1, len(means) // most)], near):
+            del frames[frame]
+    others = set(frames.values())
+    kept = [camera for camera in cameras if camera not in others]
+    blind = len(cameras) - len(kept)
+    if not blind or not any(camera.split == "train" for camera in kept):
+        return list(cameras)
+    warn(f"{blind} of {len(cameras)} cameras {'sees' if blind == 1 else 'see'} no splat, or hardly any, and {'is' if blind == 1 else 'are'} left out")
+    return kept
+
+
+def _larger(camera: Camera) -> Camera:
+    width, height = LARGER * camera.width, LARGER * camera.height
+    return replace(camera, width=width, height=height, cx=camera.cx + (width - camera.width) / 2, cy=camera.cy + (height - camera.height) / 2)
 
 
 @announced("examining views")

@@ -1,4 +1,4 @@
-"""Which views are adapted to, and in which order: introduced one after the other, then repeated in rounds. All follows from one seed."""
+"""Which views are adapted to. All follows from one seed."""
 
 from __future__ import annotations
 
@@ -8,90 +8,16 @@ from dataclasses import replace
 
 import torch
 
-from mipmap_plugin.adaptation.spreading import Halves, places, spread
 from mipmap_plugin.adaptation.viewpoints import Viewpoints
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError, plural
-from mipmap_plugin.limits import derived_seed
 from mipmap_plugin.scenes.orbits import GOLDEN, ORBIT_FOV
 from mipmap_plugin.scenes.trajectories import jittered, with_company
 
 # A checkpoint without cameras does not say at what resolution it was trained: this many px across 50 degrees is NeRF-Synthetic's.
 ORBIT_PIXELS = 800
 ORBIT_VIEWS = 50
-
-
-class ViewSchedule:
-    """The views that each step uses. It has no state, so that a run can be resumed at any step."""
-
-    def __init__(self, views: Sequence[Camera], config: AdaptConfig) -> None:
-        self._rounds, self._seed, self._steps = Rounds(views, config.seed, spread_out=config.order == "spread"), config.seed, config.steps
-        self._max_views, self._warm_up = min(config.views_per_step, len(views)), config.warm_up_steps
-        self._gathering = math.ceil(config.gathering * config.steps)  # steps during which new views are introduced
-
-    @property
-    def view_count(self) -> int:
-        """The number of views."""
-        return len(self._rounds.views)
-
-    def __call__(self, step: int, progress: float) -> list[Camera]:
-        """Return the views of a step: at first its new views and some of the earlier ones, later the next ones of a round through all.
-
-        progress: 0..1, how much of the run is over; with a time budget this may be more than the step number implies.
-        """
-        pace, count = max(step, int(progress * self._steps)), self._views_in_step(step)
-        if pace >= self._gathering:
-            first = self.draws_before(step)
-            return [self._rounds(first + number) for number in range(count)]
-        before, after = self._introduced(pace - 1), self._introduced(pace)
-        new = range(before, min(after, before + count))
-        generator = torch.Generator().manual_seed(derived_seed(self._seed, step))
-        repeated = torch.randperm(before, generator=generator)[: count - len(new)].tolist()
-        return [self._rounds(draw) for draw in (*new, *repeated)]
-
-    def _views_in_step(self, step: int) -> int:
-        """The number of views of a step. It rises during the warm-up: the first gradients are alike in all views, so few views suffice."""
-        return self._max_views if self._warm_up <= max(0, step) else math.ceil(self._max_views * (step + 1) / self._warm_up)
-
-    def draws_before(self, step: int) -> int:
-        """The number of draws of all earlier steps; that of the warm-up is rounded up to whole steps, so that rounds align with steps."""
-        if step < self._warm_up:
-            return self._draws_in_warm_up(step)
-        return (math.ceil(self._draws_in_warm_up(self._warm_up) / self._max_views) + step - self._warm_up) * self._max_views
-
-    def _draws_in_warm_up(self, step: int) -> int:
-        """The number of draws of all earlier steps of the warm-up: from which step on each has a first view, a second one, ..."""
-        return sum(max(0, step - number * self._warm_up // self._max_views) for number in range(self._max_views))
-
-    def _introduced(self, step: int) -> int:
-        """The number of views introduced up to a step: spread evenly, at least one per step, and no more per step than it uses."""
-        count = max(self._views_in_step(step), step + 1, math.ceil(len(self._rounds.views) * (step + 1) / self._gathering))
-        return min(count, self.draws_before(step + 1), len(self._rounds.views))
-
-
-class Rounds:
-    """Each view once per round, in an order that follows from (seed, round) alone, so that a run can be resumed at any step."""
-
-    def __init__(self, views: Sequence[Camera], seed: int, *, spread_out: bool = False) -> None:
-        """`spread_out`: neighbors look from all sides; otherwise the order is shuffled."""
-        self.views, self._seed = list(views), seed
-        self._halves = Halves.of(range(len(views)), places(views)) if spread_out and views else None
-        self._round = -1
-        self._order: list[int] = []
-
-    def __call__(self, draw: int) -> Camera:
-        """The `draw`-th view since the beginning of the run."""
-        round_number, position = divmod(draw, len(self.views))
-        if round_number != self._round:
-            self._round, self._order = round_number, self._order_of(round_number)
-        return self.views[self._order[position]]
-
-    def _order_of(self, round_number: int) -> list[int]:
-        generator = torch.Generator().manual_seed(derived_seed(self._seed, round_number))
-        if self._halves is not None:
-            return spread(self._halves, generator)
-        return torch.randperm(len(self.views), generator=generator).tolist()
 
 
 def extent(views: Sequence[Camera]) -> float:

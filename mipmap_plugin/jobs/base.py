@@ -66,7 +66,12 @@ class Base:
         """Load and wrap the checkpoint. Raises CheckpointError, SceneError, SettingsError, BackendUnavailable."""
         folder = self._model_folder()  # says what is wrong with the checkpoint before torch is imported
         with uncollected():
-            return self._loaded(folder, threads)
+            from mipmap_plugin.wrap import WrapOptions, check_serves, wrap_model
+
+            check_serves(self.backend, threads)
+            scene = self._given_scene(folder)  # before the splats, which take longer to read
+            told: WrapOptions = {"background": COLORS[self.background], "screen_filter": self.screen_filter, "up": self.up}
+            return wrap_model(self.checkpoint, cameras=scene, backend=self.backend, threads=threads, **told)
 
     def _model_folder(self) -> Path | None:
         """The folder of the training, also where the checkpoint is a file in it; None if there is none, or the format is not of a training."""
@@ -81,13 +86,3 @@ class Base:
         from mipmap_plugin.scenes import load_scene
 
         return None if self.cameras is None else load_scene(self.cameras, read_options(folder)[0])
-
-    def _loaded(self, folder: Path | None, threads: int | None) -> Wrapped:
-        from mipmap_plugin.backends import BACKENDS
-        from mipmap_plugin.wrap import WrapOptions, wrap_model
-
-        if self.backend != "auto":
-            BACKENDS.get(self.backend)
-        scene = self._given_scene(folder)  # before the splats, which take longer to read
-        told: WrapOptions = {"background": COLORS[self.background], "screen_filter": self.screen_filter, "up": self.up}
-        return wrap_model(self.checkpoint, cameras=scene, backend=self.backend, threads=threads, **told)

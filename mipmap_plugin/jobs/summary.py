@@ -29,8 +29,8 @@ def table(outcomes: Sequence[Outcome]) -> str:
 def _row(outcome: Outcome) -> tuple[str, ...]:
     job, report = outcome.job, outcome.report
     splats = f"{report['gaussians_before']:,} -> {report['gaussians_after']:,}" if report else ""
-    seconds = f"{outcome.seconds:.1f}"
-    return (from_here(job.base.checkpoint), f"x{job.scale:g}", job.viewer or "", outcome.status, splats, _psnr(report), seconds, _last(outcome))
+    seconds, last = f"{outcome.seconds:.1f}", from_here(outcome.file) if outcome.file else told_from_here(outcome.reason)
+    return (from_here(job.base.checkpoint), f"x{job.scale:g}", job.viewer or "", outcome.status, splats, _psnr(report), seconds, last)
 
 
 def _psnr(report: dict[str, Any]) -> str:
@@ -42,10 +42,6 @@ def _psnr(report: dict[str, Any]) -> str:
         after = next((psnr for name, psnr in psnrs.items() if str(report.get("returned", "")).startswith(name)), None)
     before = psnrs.get(AS_IT_IS)
     return "" if before is None or after is None else f"{before:.2f} -> {after:.2f}"
-
-
-def _last(outcome: Outcome) -> str:
-    return from_here(outcome.file) if outcome.file else told_from_here(outcome.reason)
 
 
 def totals(outcomes: Sequence[Outcome], count: int) -> str:

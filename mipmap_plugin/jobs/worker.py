@@ -86,20 +86,20 @@ class Worker:
         return WorkerDied(f"the process that did it ended with {f'signal {-code}' if code < 0 else f'exit code {code}'}")
 
 
-def do(job: Job, worker: Worker, attempts: int = ATTEMPTS) -> Outcome:
-    """Do a job in a worker; if that dies, in a new one, up to `attempts` times. Raises ValueError without attempts."""
-    sent = replace(job, base=job.base.unpacked())
-    for attempt in range(1, attempts + 1):
+def do(job: Job, worker: Worker) -> Outcome:
+    """Do a job in a worker; if that dies, in a new one."""
+    sent, deaths = replace(job, base=job.base.unpacked()), 0
+    while True:
         try:
             worker.begin(sent)
             outcome = worker.outcome()
             return replace(outcome, job=job, reason=told(outcome.reason))
         except WorkerDied as death:
+            deaths += 1
             if worker.stopped:
                 return Outcome(job, "interrupted", reason="interrupted")
-            if attempt == attempts:
-                return Outcome(job, "failed", reason=f"{death} ({attempts} attempts)")
-    raise ValueError(f"attempts must be at least 1, got {attempts}")
+            if deaths == ATTEMPTS:
+                return Outcome(job, "failed", reason=f"{death} ({ATTEMPTS} attempts)")
 
 
 def _start(threads: int | None) -> subprocess.Popen[bytes]:

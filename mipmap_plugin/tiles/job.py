@@ -14,8 +14,7 @@ from mipmap_plugin.models.places import state_path
 from mipmap_plugin.process import pool
 from mipmap_plugin.process import threads as thread_pool
 from mipmap_plugin.tiles.folder import work_folder
-from mipmap_plugin.tiles.halo import draw_halos
-from mipmap_plugin.tiles.layers import draw_layers
+from mipmap_plugin.tiles.halo import draw_halos, draw_layers
 from mipmap_plugin.tiles.scene import TiledScene, opened
 from mipmap_plugin.tiles.start import StartSearch
 from mipmap_plugin.tiles.steering import steer, sweep_of

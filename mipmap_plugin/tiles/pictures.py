@@ -21,29 +21,21 @@ KINDS = {"half": torch.float16, "int16": torch.int16, "uint8": torch.uint8}
 
 Box = tuple[int, int, int, int]  # left, top, right, bottom, px of the view
 
-Picture = tuple[str, Tensor, Box | None]  # its name, and what it shows of its view; None: all
-
 
 class _Entry(NamedTuple):
-    """One picture of a file."""
-
     path: Path
     start: int  # byte
     shape: tuple[int, ...]
     kind: str  # of `KINDS`
-    box: Box | None  # what it shows of its view; None: all
-
-
-def write_pictures(path: Path, pictures: Iterable[Picture]) -> None:
-    """Write pictures of the types of `KINDS` as they come, atomically; an old file is replaced. Raises OutputError."""
-    with new_pictures(path) as write:
-        for picture in pictures:
-            write(*picture)
+    box: Box  # what it shows of its view
 
 
 @contextmanager
 def new_pictures(path: Path) -> Iterator[Callable[[str, Tensor, Box | None], None]]:
-    """What writes pictures, as `write_pictures`; the file is there when the block succeeds."""
+    """A function that writes a picture of a type of `KINDS` by name, and what it shows of its view (None: all).
+
+    The file is there when the block succeeds; an old one is replaced. Raises OutputError.
+    """
     names = {kind: name for name, kind in KINDS.items()}
     table = {}
     with new_file(path, overwrite=True) as temporary, temporary.open("wb") as file:
@@ -76,17 +68,20 @@ class Album:
             file.readinto(picture.view(-1).view(torch.uint8).numpy().data)
         return picture
 
-    def box(self, name: str) -> Box | None:
-        """What a picture shows of its view; None: all."""
+    def box(self, name: str) -> Box:
+        """What a picture shows of its view."""
         return self._entries[name].box
 
 
 def _table(path: Path) -> dict[str, _Entry]:
-    """The pictures of a file, by name."""
     with path.open("rb") as file:
         file.seek(-END.size, 2)
         end = file.tell()
         (start,) = END.unpack(file.read(END.size))
         file.seek(start)
         table = json.loads(file.read(end - start))
-    return {name: _Entry(path, at, tuple(shape), kind, box and tuple(box)) for name, (at, shape, kind, box) in table.items()}
+    entries = {}
+    for name, (start, shape, kind, box) in table.items():
+        left, top, right, bottom = box or (0, 0, shape[1], shape[0])
+        entries[name] = _Entry(path, start, tuple(shape), kind, (left, top, right, bottom))
+    return entries

@@ -1,4 +1,4 @@
-"""The report of a scene that was adapted in tiles."""
+"""A scene that was adapted in tiles, judged on views that nothing was adapted to, and its report."""
 
 from __future__ import annotations
 
@@ -10,13 +10,31 @@ from typing import Any
 from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.adaptation.optimization.amount import fewer_note
 from mipmap_plugin.adaptation.optimization.ending import End
-from mipmap_plugin.adaptation.report import Report, filters, simulated, versions
+from mipmap_plugin.adaptation.report import AS_IT_IS, Report, filters, simulated, versions
 from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.errors import plural
 from mipmap_plugin.formats.ply import read_header
+from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.models.mip import unread
+from mipmap_plugin.tiles.folder import START
 from mipmap_plugin.tiles.scene import TiledScene
-from mipmap_plugin.tiles.steering import result
+from mipmap_plugin.tiles.start import psnr
+from mipmap_plugin.tiles.steering import Steered, open_state, result
+from mipmap_plugin.tiles.truth import Truths
+
+JOINED = "the joined tiles"
+
+
+def judged(scene: TiledScene) -> tuple[dict[str, float], str]:
+    """The PSNR (dB) of each on whole views, and the name of what is returned: the best, or the last where the settings say so."""
+    if not scene.views.choosing:
+        return {}, JOINED
+    truths, start = Truths(scene), f"the start, {load_torch(scene.folder / START)['name']}"
+    first, last = (open_state(scene, state) for state in (Steered.before(scene.folder, 0), result(scene.folder)))
+    states = {AS_IT_IS: scene.base, start: first, JOINED: last}
+    psnrs = {name: psnr(scene, splats, truths, scene.views.choosing) for name, splats in states.items()}
+    best = max(reversed(psnrs), key=psnrs.__getitem__)
+    return psnrs, JOINED if scene.config.returns == "last" else best
 
 
 def make_report(
@@ -36,7 +54,7 @@ def make_report(
     lost += [sentence for sentence in [unread(scene.viewer, model, files[0])] if sentence]
     for note in lost:
         warnings.warn(note, stacklevel=2)
-    psnr = validation.get(returned, 0.0)
+    last = CurvePoint(step=steps, seconds=seconds["total"], validation_db=validation.get(returned, 0.0), gaussians=after)
     return Report(
         scale=scene.scale,
         base=scene.digest,
@@ -55,7 +73,7 @@ def make_report(
         ended_by=_ended_by(scene, tiles, f"{plural(len(files), 'tile')} of {plural(steps, 'step')}"),
         returned=returned,
         validation=validation,
-        curve=[CurvePoint(step=steps, seconds=seconds["total"], psnr_db=None, validation_db=psnr, gaussians=after)],
+        curve=[last],
         versions=versions(),
         notes=[*scene.doubts, *lost],
     )

@@ -31,9 +31,8 @@ from mipmap_plugin.process.freed_memory import return_freed_memory
 from mipmap_plugin.progress import announced, counted
 from mipmap_plugin.tiles.folder import START, halo_file, layer_file, part_file, run_file, steered_file, truth_file, work_folder
 from mipmap_plugin.tiles.job import TileJob, Work
-from mipmap_plugin.tiles.judge import JOINED, judged
 from mipmap_plugin.tiles.plan import alone, claim, cut_for, refuse
-from mipmap_plugin.tiles.report import make_report
+from mipmap_plugin.tiles.report import JOINED, judged, make_report
 from mipmap_plugin.tiles.scene import TiledScene, close_opened, opened
 from mipmap_plugin.tiles.steering import Steered, open_state, result, sweep_of
 from mipmap_plugin.tiles.sweeps import Sweep
@@ -70,28 +69,24 @@ def adapt_all_in_tiles(jobs: Sequence[Job], tiles: int, engine: Engine = in_this
 
     `threads`: for what is done between the jobs.
     """
+    if not jobs:
+        return
     for job in jobs:
         refuse(job, tiles)
     with alone(jobs):
-        yield from _adapt_all(jobs, tiles, engine, threads)
-
-
-def _adapt_all(jobs: Sequence[Job], tiles: int, engine: Engine, threads: int | None) -> Iterator[Joined]:
-    began = time.perf_counter()
-    if not jobs:
-        return
-    claim(jobs, tiles)
-    with announced("cutting"):
-        cut_for(jobs, tiles)
-    return_freed_memory()
-    with _uncut_if_refused(jobs):
-        for job in jobs:
-            _opened(job).wrapped.refuse_output(job.target, overwrite=job.overwrite, networks_move=False, viewer=job.viewer)
-        _examine_views(jobs)
-    for number, job in enumerate(jobs):
-        stages = _Stages(job, tuple(jobs[number + 1 :]), engine, {"cutting": time.perf_counter() - began})
-        yield _adapted_and_saved(_opened(job), stages, began, threads)
         began = time.perf_counter()
+        claim(jobs, tiles)
+        with announced("cutting"):
+            cut_for(jobs, tiles)
+        return_freed_memory()
+        with _uncut_if_refused(jobs):
+            for job in jobs:
+                _opened(job).wrapped.refuse_output(job.target, overwrite=job.overwrite, networks_move=False, viewer=job.viewer)
+            _examine_views(jobs)
+        for number, job in enumerate(jobs):
+            stages = _Stages(job, tuple(jobs[number + 1 :]), engine, {"cutting": time.perf_counter() - began})
+            yield _adapted_and_saved(_opened(job), stages, began, threads)
+            began = time.perf_counter()
 
 
 def _opened(job: Job) -> TiledScene:

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.amount import affordable_for
 from mipmap_plugin.adaptation.optimization.validation import split_validation
-from mipmap_plugin.adaptation.seeing import seeing
-from mipmap_plugin.adaptation.shown import orbited, showing
+from mipmap_plugin.adaptation.shown import orbited, seeing, showing
 from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.viewpoints import Viewpoints, orbit_of
 from mipmap_plugin.adaptation.views import choose_views

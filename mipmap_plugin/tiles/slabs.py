@@ -76,12 +76,8 @@ class Painter:
         """The picture [H, W, 3] of all splats in front of the background."""
         return self.draw(splats, camera).over(torch.tensor(self.effects.background))
 
-    def blend_weights(self, splats: Splats, cameras: Sequence[Camera]) -> Tensor:
-        """The mean blend weight [N] of each splat over views, in pixels (`start.blend_weights`, for splats on the disk)."""
-        return self.weighed(splats, cameras)[0]
-
     def weighed(self, splats: Splats, cameras: Sequence[Camera]) -> tuple[Tensor, float]:
-        """`blend_weights`, and the fraction of the splats that a view shows, mean over views; what is hidden behind others does not count."""
+        """`blend_weights.weighed` of splats on the disk: the mean blend weight [N] of each over views, px, and the fraction that a view shows."""
         total, shown = torch.zeros(len(splats)), 0.0
         for view in cameras:
             weights = torch.zeros(len(splats))
@@ -99,18 +95,13 @@ class Painter:
         through = torch.ones(*camera.size, 1)
         for slab in parts:
             gaussians = splats.gaussians(slab, colored=False)
-            if len(parts) == 1 and (known := self._known_weights(gaussians, camera, effects)) is not None:
+            weigh = getattr(self.backend, "blend_weights", None) if len(parts) == 1 else None  # which knows nothing of what is in front
+            if weigh is not None and (known := weigh(gaussians, camera, effects)) is not None:
                 weights[slab] += known
                 return
             weights[slab] += self._slab_weights(gaussians, camera, effects, through)
             if float(through.max()) < effects.settings.min_transmittance:
                 return
-
-    def _known_weights(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor | None:
-        """The blend weights [M] that the backend computes itself, if it can, of splats with nothing in front of them."""
-        weigh = getattr(self.backend, "blend_weights", None)
-        known: Tensor | None = None if weigh is None else weigh(gaussians, camera, effects)
-        return known
 
     @torch.enable_grad()
     def _slab_weights(self, gaussians: Gaussians, camera: Camera, effects: Effects, through: Tensor) -> Tensor:

@@ -19,7 +19,6 @@ from mipmap_plugin.adaptation.start.merging import merge_seen
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.process import pool
 from mipmap_plugin.tiles.folder import START, start_file
 from mipmap_plugin.tiles.scene import TiledScene
@@ -66,7 +65,7 @@ class StartSearch:
         weights, shown = painter.weighed(scene.base, first)
         self.views = evenly(scene.views.adapted, views_for(shown))
         if further := [view for view in self.views if view not in first]:
-            weights = weights.lerp(painter.blend_weights(scene.base, further), len(further) / (len(first) + len(further)))
+            weights = weights.lerp(painter.weighed(scene.base, further)[0], len(further) / (len(first) + len(further)))
         return weights * scene.scale**2
 
     def _takes_merged(self, weights: Tensor, formed_db: float, base_db: float) -> bool:
@@ -112,7 +111,7 @@ class StartSearch:
         """Write a core's candidate; returns its blend weights, and those that it had if nothing hid it."""
         scene = self.scene
         model = scene.for_target(scene.base.parameters(core))
-        found = [weights[core], torch.empty(0)]
+        own, whole = weights[core], torch.empty(0)
 
         def sizes(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
             """Of a base pixel at each splat, and of the splat's weight if nothing hid it."""
@@ -120,13 +119,15 @@ class StartSearch:
             return pixel, whole_weights(gaussians, pixel, scene.views.adapted, scene.base_effects, scene.scale)
 
         def merged(gaussians: Gaussians) -> Gaussians:
-            pixel, whole = sizes(gaussians)
-            seen = may_show(weights[core], whole, gaussians.means, scene.views.adapted, self.views)
-            splats, found[0] = merge_seen(gaussians, pixel / scene.scale, weights[core], fraction, seen)
+            nonlocal own
+            pixel, before = sizes(gaussians)
+            seen = may_show(own, before, gaussians.means, scene.views.adapted, self.views)
+            splats, own = merge_seen(gaussians, pixel / scene.scale, own, fraction, seen)
             return splats
 
         def formed(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
-            pixel, found[1] = sizes(gaussians)
+            nonlocal whole
+            pixel, whole = sizes(gaussians)
             known = pixel if scene.scale <= 1 else None
             form = FormSettings(1.0 if self.matches else AREA_POWER, scene.config.crispness, len(self.views), known)
             return closed_form(gaussians, scene.views.adapted, scene.scale, scene.base_effects, scene.target, form)
@@ -136,7 +137,7 @@ class StartSearch:
         if self.forms:
             model.reshape(formed)
         write_store(file, model.parameters())
-        return found[0], found[1]
+        return own, whole
 
     def _match(self, name: str, wanted: Tensor, whole: Tensor) -> None:
         """Give the splats opacities with which they have the `wanted` blend weights [N] (`start.matching`), and write them again.
@@ -149,14 +150,14 @@ class StartSearch:
 
         def weights_of(opacities: Tensor) -> Tensor:
             splats.opacities = opacities
-            return painter.blend_weights(splats, views)
+            return painter.weighed(splats, views)[0]
 
         opacities = torch.cat([part.shapes[:, -1] for part in splats.parts]).sigmoid()
         splats.release()
         opacities = matched_opacities(opacities, wanted, whole, weights_of)
         for number, (part, matched) in enumerate(zip(splats.parts, opacities.split([*map(len, splats.parts)]), strict=True)):
             model = self.scene.for_target(part.parameters())
-            _set_opacities(model, matched)
+            model.reshape(lambda gaussians: (gaussians.scales, matched))  # noqa: B023  # it is called at once
             write_store(self._file(name, number), model.parameters())
 
     def _take_base(self, psnr: float) -> None:
@@ -173,13 +174,9 @@ class StartSearch:
         save_torch(self.scene.folder / START, {"name": title, "psnr": psnr}, overwrite=True)
 
 
-def _set_opacities(model: VanillaModel, opacities: Tensor) -> None:
-    model.reshape(lambda gaussians: (gaussians.scales, opacities))
-
-
 @torch.no_grad()
 def psnr(scene: TiledScene, splats: Splats, truths: Truths, views: Any) -> float:
     """The mean PSNR (dB) of splats as the target shows them over views, of images and truths clamped as a display does (`validation.mean_db`)."""
     painter = scene.painter(scene.target)
-    images = ((painter.image(splats, view.zoomed(scene.scale)), truths(view)) for view in views)
+    images = ((painter.image(splats, view.zoomed(scene.scale)), truths[view.name]) for view in views)
     return mean_db([float((image.clamp(0, 1) - truth.clamp(0, 1)).square().mean()) for image, truth in images])

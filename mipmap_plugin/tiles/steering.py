@@ -13,7 +13,8 @@ from dataclasses import asdict, dataclass, replace
 from itertools import count
 from pathlib import Path
 
-from mipmap_plugin.adaptation.optimization.validation import HARM_DB, RATE_REDUCTION, TIE_DB, warmed_up
+from mipmap_plugin.adaptation.optimization.steering import RATE_REDUCTION, warmed_up
+from mipmap_plugin.adaptation.optimization.validation import HARM_DB, TIE_DB
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.torch_file import load_torch

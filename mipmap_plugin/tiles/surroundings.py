@@ -23,9 +23,8 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.tiles.folder import halo_file, layer_file
-from mipmap_plugin.tiles.halo import FINE
-from mipmap_plugin.tiles.layers import on_black, within
-from mipmap_plugin.tiles.pictures import Album, Box
+from mipmap_plugin.tiles.halo import FINE, on_black, within
+from mipmap_plugin.tiles.pictures import Album
 from mipmap_plugin.tiles.scene import TiledScene
 from mipmap_plugin.tiles.sweeps import Sweep
 from mipmap_plugin.tiles.truth import Truths, parts
@@ -64,14 +63,9 @@ class Surroundings:
         name = f"{view.name}/{self._number}"
         if name not in self._halos:
             return None
-        left, top, right, bottom = self._box(view.name)
+        left, top, right, bottom = self._halos.box(name)
         target = view.zoomed(self._scene.scale)
         return replace(target, width=right - left, height=bottom - top, cx=target.cx - left, cy=target.cy - top, zoom=1.0)
-
-    def _box(self, name: str) -> Box:
-        box = self._halos.box(f"{name}/{self._number}")
-        assert box is not None  # since those of tiles have one
-        return box
 
     def _surrounding(self, name: str) -> _Surrounding:
         with self._lock:
@@ -82,12 +76,11 @@ class Surroundings:
             return self._kept[name]
 
     def _read(self, name: str) -> _Surrounding:
-        box = self._box(name)
-        through, behind, share = (self._halos[f"{name}/{self._number}"].float() / FINE).split((1, 3, 1), dim=2)
-        image = within(from_16_bits(self._halos[name]), box)
-        truth = within(self._truths.named(name), box)
-        x, y = (self._layers.box(name) or (0, 0))[:2]
-        left, top, right, bottom = box
+        own = f"{name}/{self._number}"
+        through, behind, share = (self._halos[own].float() / FINE).split((1, 3, 1), dim=2)
+        left, top, right, bottom = box = self._halos.box(own)
+        image, truth = within(from_16_bits(self._halos[name]), box), within(self._truths[name], box)
+        x, y, *_ = self._layers.box(name)
         before = within(self._layers[name], (left - x, top - y, right - x, bottom - y)).float()
         core = through * before[..., :3] + before[..., 3:] * behind
         return _Surrounding(image - core, through, behind, truth + (1 - share) * (image - truth))

@@ -15,7 +15,8 @@ from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
-from mipmap_plugin.adaptation.optimization.validation import Steering, no_validation
+from mipmap_plugin.adaptation.optimization.steering import Steering
+from mipmap_plugin.adaptation.optimization.validation import no_validation
 from mipmap_plugin.adaptation.renderers import color_limits
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.tiles.folder import run_file, start_file, tile_file

@@ -76,10 +76,6 @@ class Truths:
     def __init__(self, scene: TiledScene) -> None:
         self._album = Album(truth_file(scene.folder, part) for part in range(parts(scene.used_views)))
 
-    def __call__(self, view: Camera) -> Tensor:
-        """The truth [h, w, 3] of a whole view, which is found by its name."""
-        return self.named(view.name)
-
-    def named(self, name: str) -> Tensor:
-        """The truth [h, w, 3] of the view of this name."""
+    def __getitem__(self, name: str) -> Tensor:
+        """The truth [h, w, 3] of the whole view of this name."""
         return from_16_bits(self._album[name])

@@ -9,7 +9,7 @@ import torch
 from brief_runs import BRIEF, BRIEF_PAPER, WHITE, shown, wrapped
 
 from mipmap_plugin.adaptation.optimization.budget import Pace
-from mipmap_plugin.adaptation.optimization.estimate import Costs
+from mipmap_plugin.adaptation.optimization.costs import Costs
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.torch_file import load_torch

@@ -8,8 +8,7 @@ from cut_scenes import cut_in_three
 
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job
-from mipmap_plugin.tiles.halo import draw_halos
-from mipmap_plugin.tiles.layers import draw_layers
+from mipmap_plugin.tiles.halo import draw_halos, draw_layers
 from mipmap_plugin.tiles.start import StartSearch
 
 

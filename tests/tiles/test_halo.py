@@ -84,11 +84,11 @@ def test_all_tiles_together_are_asked_to_mend_the_whole_error(halved):
     splats, view, _, around = whole_and_tiles(halved)
     size = view.zoomed(halved.scale).size
     image = shown_in(halved, splats, view, view.zoomed(halved.scale))
-    error = Truths(halved)(view) - image
+    error = Truths(halved)[view.name] - image
     asked = torch.zeros(*size, 3)
     for halo in around:
         crop = halo.crop(view)
-        left, top, right, bottom = halo._box(view.name)
+        left, top, right, bottom = halo._halos.box(f"{view.name}/{halo._number}")
         asked[top:bottom, left:right] += halo.wanted(crop) - image[top:bottom, left:right]
     assert error.abs().max() > 0.1
     middle = (slice(2, 6), slice(3, 7))

@@ -20,7 +20,7 @@ from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.tiles import slabs
 from mipmap_plugin.tiles.cut import cut, front_to_back
 from mipmap_plugin.tiles.folder import CUT
-from mipmap_plugin.tiles.pictures import Album, write_pictures
+from mipmap_plugin.tiles.pictures import Album, new_pictures
 from mipmap_plugin.tiles.reading import make_cut
 from mipmap_plugin.tiles.slabs import Painter
 from mipmap_plugin.tiles.splats import Splats
@@ -130,10 +130,12 @@ def test_slabs_are_cut_by_depth():
 def test_pictures_come_back_one_by_one(tmp_path):
     small = torch.full((1, 1, 5), 7).to(torch.uint8)
     pictures = {"1": torch.rand(3, 4, 3).half(), "2": torch.randint(-9, 9, (2, 5, 3), dtype=torch.int16), "2/0": small}
-    write_pictures(tmp_path / "a", ((name, picture, (1, 2, 3, 4) if "/" in name else None) for name, picture in pictures.items()))
+    with new_pictures(tmp_path / "a") as write:
+        for name, picture in pictures.items():
+            write(name, picture, (1, 2, 3, 4) if "/" in name else None)
     album = Album([tmp_path / "a"])
     assert all(torch.equal(album[name], picture) for name, picture in pictures.items())
-    assert album.box("2/0") == (1, 2, 3, 4) and album.box("1") is None and "3" not in album
+    assert album.box("2/0") == (1, 2, 3, 4) and album.box("1") == (0, 0, 4, 3) and "3" not in album
 
 
 def test_slabs_give_the_picture_of_all_splats(on_disk, monkeypatch):
@@ -157,10 +159,10 @@ def test_slabs_give_the_blend_weights_of_all_splats(on_disk, monkeypatch):
 def test_strips_give_the_blend_weights_of_their_view(on_disk, monkeypatch):
     splats, _ = on_disk
     view, painter = tiny.cameras(1), Painter(ReferenceBackend(), EFFECTS)
-    whole = painter.blend_weights(splats, view)
+    whole, _ = painter.weighed(splats, view)
     monkeypatch.setattr(slabs, "MOST_PIXELS", 300)
     assert [strip.height for strip in slabs.strips(view[0])] == [8, 8, 8]
-    assert torch.allclose(painter.blend_weights(splats, view), whole, atol=0.02, rtol=0.01)  # the frame limits how oblique a splat may be drawn
+    assert torch.allclose(painter.weighed(splats, view)[0], whole, atol=0.02, rtol=0.01)  # the frame limits how oblique a splat may be drawn
 
 
 def test_a_plain_text_file_is_refused(tmp_path):

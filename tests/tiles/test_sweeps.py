@@ -11,7 +11,7 @@ import torch
 from cut_scenes import config, cut_in_three
 
 from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS
-from mipmap_plugin.adaptation.views import ViewSchedule
+from mipmap_plugin.adaptation.schedule import ViewSchedule
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
@@ -78,8 +78,8 @@ def test_a_truth_brighter_than_white_is_judged_as_it_is_displayed():
     """As without tiles: a bicubic filter makes it so beside edges."""
     filled = lambda level: torch.full((2, 2, 3), level)  # noqa: E731
     painter = SimpleNamespace(image=lambda splats, view: filled(1.0))
-    scene = SimpleNamespace(painter=lambda target: painter, target=None, scale=0.5)
-    assert psnr(scene, None, lambda view: filled(1.1), tiny.cameras(1)) == psnr(scene, None, lambda view: filled(1.0), tiny.cameras(1))
+    scene, [view] = SimpleNamespace(painter=lambda target: painter, target=None, scale=0.5), tiny.cameras(1)
+    assert psnr(scene, None, {view.name: filled(1.1)}, [view]) == psnr(scene, None, {view.name: filled(1.0)}, [view])
 
 
 def test_a_run_is_cut_into_a_warm_up_and_sweeps():

@@ -9,13 +9,11 @@ import tiny
 import torch
 from equal_models import SCALE, same
 
-from mipmap_plugin.adaptation.optimization import loop
+from mipmap_plugin.adaptation.optimization.checks import checks_until, is_checked
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.run import Run
-from mipmap_plugin.adaptation.optimization.validation import (
-    HARM_DB,
-    Steering,
-)
+from mipmap_plugin.adaptation.optimization.steering import Steering
+from mipmap_plugin.adaptation.optimization.validation import HARM_DB
 from mipmap_plugin.adaptation.renderers import Renderer
 from mipmap_plugin.adaptation.start import candidates as start
 from mipmap_plugin.adaptation.target.resize import resize
@@ -112,8 +110,8 @@ def test_a_budget_of_nothing_returns_the_start(closed_form, monkeypatch):
 )
 def test_short_runs_are_checked_more_often_and_so_is_the_warm_up(settings, checks):
     config = recipe("default", SCALE, **settings)
-    assert [step for step in range(1, config.steps + 1) if loop.is_checked(step, config)] == checks
-    assert [step for step in range(1, config.steps + 1) if loop.checks_until(config, step) > loop.checks_until(config, step - 1)] == checks
+    assert [step for step in range(1, config.steps + 1) if is_checked(step, config)] == checks
+    assert [step for step in range(1, config.steps + 1) if checks_until(config, step) > checks_until(config, step - 1)] == checks
 
 
 @pytest.mark.parametrize(

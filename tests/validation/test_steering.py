@@ -7,15 +7,8 @@ from equal_models import SCALE, same
 
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer, restore_snapshot
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
-from mipmap_plugin.adaptation.optimization.validation import (
-    FIRST_RATE_FACTOR,
-    HARM_DB,
-    LOST_DB,
-    LOST_FRACTION,
-    RATE_REDUCTION,
-    TIE_DB,
-    Steering,
-)
+from mipmap_plugin.adaptation.optimization.steering import FIRST_RATE_FACTOR, LOST_DB, LOST_FRACTION, RATE_REDUCTION, Steering
+from mipmap_plugin.adaptation.optimization.validation import HARM_DB, TIE_DB
 from mipmap_plugin.recipes import recipe
 
 

@@ -79,22 +79,21 @@ def takes_steps(config: AdaptConfig, scale: float, base: Effects, targets: Itera
 
 
 def affordable_for_model(config: AdaptConfig, base: SplatModel, views: Sequence[Camera], near: float) -> AdaptConfig:
-    """`affordable_for` a model's splats, and `validated_in_budget`. Draws that the moments of a moving scene take are not available for steps."""
-    config = validated_in_budget(config, base.parameters()["means"], views, near)
+    """`affordable_for` a model's splats, with as many views for validation as a time budget allows.
+
+    Draws that the moments of a moving scene take are not available for steps.
+    """
+    means = base.parameters()["means"]
+    if config.time_budget_s is not None:
+        in_views = splats_in_view(means, views, near) if views else len(means)
+        most_views = max(MIN_VIEWS, int(VALIDATED_A_SECOND * config.time_budget_s / max(1.0, in_views)))
+        config = config.model_copy(update={"validation_views": min(config.validation_views, most_views)})
     if config.most_draws is None or not (base.traits.moves or base.traits.same_for_all_views):
         return config
     moments = ROUNDS * (affordable_moments(config, base) or 0) * _evaluation(base)
     left = config.model_copy(update={"most_draws": max(config.most_draws - moments, (1 - FOR_MOMENTS) * config.most_draws)})
-    fewer = affordable_for(left, base.parameters()["means"], views, near)
+    fewer = affordable_for(left, means, views, near)
     return fewer.model_copy(update={"most_draws": config.most_draws})
-
-
-def validated_in_budget(config: AdaptConfig, means: torch.Tensor, views: Sequence[Camera], near: float) -> AdaptConfig:
-    """The settings with as many views for validation as a time budget allows for splats at `means` [N, 3]; without views all of them count."""
-    if config.time_budget_s is None:
-        return config
-    most = VALIDATED_A_SECOND * config.time_budget_s / max(1.0, splats_in_view(means, views, near) if views else len(means))
-    return config.model_copy(update={"validation_views": min(config.validation_views, max(MIN_VIEWS, int(most)))})
 
 
 def affordable_for(config: AdaptConfig, means: torch.Tensor, views: Sequence[Camera], near: float) -> AdaptConfig:

@@ -1,4 +1,4 @@
-"""What the parts of a run have cost so far, and the time that is left.
+"""The time that a run has left, and the progress bar that shows it.
 
 Steps do not all take the same time: in the warm-up they use fewer views, and at first most views are new, so that their truth has to be made.
 """
@@ -6,68 +6,19 @@ Steps do not all take the same time: in the warm-up they use fewer views, and at
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
-import torch
-from torch import Tensor
-
+from mipmap_plugin.adaptation.optimization.checks import checks_until
+from mipmap_plugin.adaptation.optimization.costs import Costs
 from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
-from mipmap_plugin.adaptation.views import ViewSchedule
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.adaptation.optimization.run import Run, Task
+from mipmap_plugin.adaptation.schedule import ViewSchedule
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.process import threads
-from mipmap_plugin.process.clock import now
 from mipmap_plugin.progress import Bar
 
-Result = TypeVar("Result")
-
-
-@dataclass
-class Costs:
-    """Seconds, by what they were spent on. Work in parallel counts as the time that passed; that of a GPU until it is done."""
-
-    truths: dict[Camera, float] = field(default_factory=dict)  # of making the truth of each view
-    checks: list[float] = field(default_factory=list)  # of each comparison with the validation views
-    earlier: tuple[float, float] = (0.0, 0.0)  # of truths and of checks, in the processes that a run was interrupted in
-    motion: Callable[[], float] = lambda: 0.0  # of evaluating the field of a moving scene, so far; not part of the others
-    device: torch.device | None = None  # that does the work
-
-    def truth(self, view: Camera, make: Callable[[Camera], Tensor]) -> Tensor:
-        """Return the truth of a view; the first time, note how long it took."""
-        if view in self.truths:
-            return make(view)
-        began = self._now()
-        image = make(view)
-        self.truths.setdefault(view, (self._now() - began) / threads.side_by_side_now())
-        return image
-
-    def prepare(self, views: Sequence[Camera], make: Callable[[Sequence[Camera]], object]) -> None:
-        """Make the truths of `views`, which have none yet, together; note how long that took."""
-        began = self._now()
-        make(views)
-        each = (self._now() - began) / len(views)
-        for view in views:
-            self.truths.setdefault(view, each)
-
-    def check(self, validate: Callable[[], Result]) -> Result:
-        """Return the result of a validation, and note how long it took."""
-        began = self._now()
-        result = validate()
-        self.checks.append(self._now() - began)
-        return result
-
-    def sums(self) -> tuple[float, float]:
-        """The seconds of all truths, and of all checks, of the whole run."""
-        return self.earlier[0] + sum(self.truths.values()), self.earlier[1] + sum(self.checks)
-
-    def seconds(self) -> float:
-        """All that is noted."""
-        return sum(self.sums())
-
-    def _now(self) -> float:
-        return now(self.device) - self.motion()
+BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{left}, {rate_fmt}{postfix}]"
 
 
 @dataclass(frozen=True)
@@ -76,12 +27,11 @@ class Forecast:
 
     schedule: ViewSchedule
     config: AdaptConfig
-    checks_until: Callable[[int], int]  # the number of checks up to and after a step
     evaluations: Evaluations  # of the field of a moving scene
     first_step: int = 0  # steps that an earlier process has done
     history: list[tuple[int, float]] = field(default_factory=list)  # draws and seconds of the views alone, before each step of this process
 
-    def left(self, step: int, seconds: float, costs: Costs, ceiling: float = 1.0) -> float:
+    def left(self, step: int, seconds: float, costs: Costs, ceiling: float) -> float:
         """Seconds left after `step`, of which everything since the first step has taken `seconds`; infinity before there is a step.
 
         `ceiling`: of the rates' factor (`Steering`).
@@ -94,24 +44,40 @@ class Forecast:
         draws, spent = self.history[len(self.history) // 2 - 1] if len(self.history) > 1 else (first, 0.0)
         a_view = (self.history[-1][1] - spent) / (done - draws)
         new_views = max(0, min(self.schedule.view_count, last) - len(costs.truths))
-        checks = self.checks_until(self.config.steps) - self.checks_until(step)
+        checks = checks_until(self.config, self.config.steps) - checks_until(self.config, step)
         motion = self.evaluations.seconds(step, ceiling, last - done, checks)
         return (last - done) * a_view + new_views * _mean(costs.truths.values()) + checks * _mean(costs.checks) + motion
 
 
-def _mean(seconds: Any) -> float:
+def _mean(seconds: Collection[float]) -> float:
     return sum(seconds) / len(seconds) if seconds else 0.0
 
 
 class StepsBar(Bar):
     """A progress bar of steps that shows the time left by a forecast, where tqdm would take all steps as equally long."""
 
+    forecast: Forecast
+    began: float  # seconds of the run, but for those in its costs, as the bar began
     seconds_left = math.inf
+
+    @classmethod
+    def of(cls, run: Run, task: Task, config: AdaptConfig, order: ViewSchedule) -> StepsBar:
+        """The bar of a run that begins or goes on."""
+        bar = cls(total=config.steps, initial=run.step, desc=f"adapting {task.part or f'x{task.scale:g}'}", unit="step", bar_format=BAR)
+        bar.forecast = Forecast(order, config, Evaluations(task.follow, config, len(task.validation.steering)), run.step)
+        bar.began = run.watch.seconds - run.costs.seconds()
+        return bar
+
+    def show(self, run: Run, task: Task, config: AdaptConfig) -> None:
+        """Show that a step is taken, the time left and, after a check, how good the run is."""
+        left = self.forecast.left(run.step, run.watch.seconds - self.began, run.costs, run.steering.ceiling)
+        self.seconds_left = min(left, run.budget_left(config))
+        self.update()
+        if run.curve[-1].step == run.step:
+            quality = f"{run.curve[-1].validation_db:.2f} dB, " if task.validation.steering else ""
+            self.set_postfix_str(f"{quality}{run.curve[-1].gaussians} splats")
 
     @property
     def format_dict(self) -> dict[str, Any]:
         left = "?" if math.isinf(self.seconds_left) else self.format_interval(self.seconds_left)
         return {**super().format_dict, "left": left}
-
-
-BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{left}, {rate_fmt}{postfix}]"

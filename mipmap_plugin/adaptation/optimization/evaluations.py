@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from mipmap_plugin.adaptation.following import Following
 from mipmap_plugin.adaptation.optimization.optimizer import decayed
-from mipmap_plugin.adaptation.optimization.validation import warmed_up
+from mipmap_plugin.adaptation.optimization.steering import warmed_up
 from mipmap_plugin.config import AdaptConfig
 
 # Splats wander: the tenth that moves farthest has come as far as the root of the sum of all squared rates, times about this (1.5 to 6).
@@ -46,14 +45,13 @@ class Evaluations:
         return self._follow.evaluation * self._count(step, ceiling, draws + checks * self._checked)
 
     def of_all_steps(self) -> float:
-        """Seconds that the evaluations of a whole run take, before its first step."""
-        if not self._follow.moments:
-            return 0.0
+        """Seconds that the evaluations of a whole run of a moving scene take, before its first step."""
         return self._follow.evaluation * self._count(0, 1.0, self._config.steps * self._config.views_per_step)
 
     def _count(self, step: int, ceiling: float, draws: float) -> float:
         """How many evaluations so many draws after `step` need."""
-        wandered = (self._squares + self._rates(step, ceiling).square().cumsum(0)).sqrt()  # px after each step
+        rates = self._config.rates.means * self._factors[step:].clamp(max=ceiling)  # px
+        wandered = (self._squares + rates.square().cumsum(0)).sqrt()  # px after each step
         before, most = self._squares**0.5, self._follow.moments
         a_round = (before + self._follow.reach / SPEED) / (self._follow.rounds + 1)  # as if one had taken what is usual
         rounds = (self._follow.rounds % 1 + (wandered - before) / a_round).long()
@@ -61,7 +59,3 @@ class Evaluations:
         new[0] = self._follow.unknown
         views = rounds.bincount() * draws / len(rounds)
         return float((new * -torch.expm1(-views / most)).sum())
-
-    def _rates(self, step: int, ceiling: float) -> Tensor:
-        """The learning rates of the means from `step` on, px."""
-        return self._config.rates.means * self._factors[step:].clamp(max=ceiling)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from mipmap_plugin.adaptation.optimization.estimate import Costs
+from mipmap_plugin.adaptation.optimization.costs import Costs
 from mipmap_plugin.process import threads
 
 # Steps of a trial with each number of threads; the shortest counts, because others are longer by chance.

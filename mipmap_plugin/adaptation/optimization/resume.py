@@ -10,21 +10,20 @@ from typing import Any, NoReturn
 import torch
 
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch
+from mipmap_plugin.adaptation.optimization.costs import Costs
 from mipmap_plugin.adaptation.optimization.density import ScreenGradients
 from mipmap_plugin.adaptation.optimization.ending import End
-from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.run import Run, Task, Trial
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.adaptation.optimization.state_file import StateFile, claim_state_file
-from mipmap_plugin.adaptation.optimization.validation import Steering
+from mipmap_plugin.adaptation.optimization.steering import Steering
 from mipmap_plugin.adaptation.report import versions
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import CheckpointError, OutputError, SettingsError
 from mipmap_plugin.formats.atomic import refuse_output
 from mipmap_plugin.formats.torch_file import load_torch, save_torch
 from mipmap_plugin.models.base import SplatModel
-from mipmap_plugin.splatting.bands import neighbors
 
 # Seconds between two saved states: the most that a killed process loses. A state is about three times as large as the model, four times
 # with growth on trial.
@@ -44,6 +43,7 @@ class StateKeeper:
     def __init__(self, path: Path | None, fingerprint: str) -> None:
         self._requested, self._fingerprint = path, fingerprint
         self.file: StateFile | None = None  # where this run saves its state
+        self._state: dict[str, Any] | None = None  # that was found there, until the run goes on from it
         self._saved_at, self._took = time.monotonic(), 0.0
 
     def start_or_resume(self, student: SplatModel, task: Task, config: AdaptConfig, spent: float) -> Run:
@@ -54,29 +54,29 @@ class StateKeeper:
         if self._requested is None:
             return Run.start(student, task, config, spent)
         refuse_output(self._requested, overwrite=True, is_file=True)
-        states: list[dict[str, Any]] = []
         try:
-            self.file = claim_state_file(self._requested, lambda path: self._whose(path, states))
+            self.file = claim_state_file(self._requested, self._whose)
         except OSError as error:
             warnings.warn(f"{self._requested} cannot be written ({error.strerror}), so that this run could not be resumed", stacklevel=2)
-        if not states:
+        state, self._state = self._state, None
+        if state is None:
             try:
                 return Run.start(student, task, config, spent)
             except BaseException:  # Ctrl-C too: its traceback would hold the lock, so that a folder without a state would stay
                 self._release()
                 raise
         try:
-            return load_run(states[0], student, config)
+            return load_run(state, student, config)
         except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-            if others := _of_another_version(states[0]):
+            if others := _of_another_version(state):
                 raise SettingsError(f"{self._path}: this state {others}, or delete it to start anew") from error
             raise SettingsError(f"{self._path}: this state of a run is incomplete; delete it to start anew ({error})") from error
 
-    def _whose(self, path: Path, states: list[dict[str, Any]]) -> str:
-        """Append the state in a file to `states` and return "" if it belongs to this run; else say whose it is, and what to do with it."""
+    def _whose(self, path: Path) -> str:
+        """Keep the state in a file and return "" if it belongs to this run; else say whose it is, and what to do with it."""
         state = _read(path)
         if isinstance(state, dict) and state.get("fingerprint") == self._fingerprint:
-            states.append(state)
+            self._state = state
             return ""
         return _of_another_version(state) or "belongs to another base, settings or views; repeat the run with those"
 
@@ -158,19 +158,9 @@ def load_run(state: dict[str, Any], student: SplatModel, config: AdaptConfig) ->
         if not isinstance(state[name], kind):
             raise TypeError(f"{name} must be of type {kind.__name__}")
     device, still = student.parameters()["means"].device, [name for name, tensor in student.parameters().items() if not tensor.requires_grad]
-    # A GPU sums blend weights in any order, so that merging again may leave another number of splats.
-    if state["rows_changed"] or state["parameters"]["means"].shape != student.parameters()["means"].shape:
-        rows = neighbors({name: tensor.to(device) for name, tensor in state["parameters"].items()})
-        student.replace_parameters({name: tensor.requires_grad_() for name, tensor in rows.items()})
-        for name in still:  # as in an uninterrupted run, whose steps are others with a gradient more
-            student.parameters()[name].requires_grad_(False)
-    else:  # the rows are those that the run began with, so that the model's other data by row still match them
-        with torch.no_grad():
-            for name, tensor in student.parameters().items():
-                tensor.copy_(state["parameters"][name])
-    with torch.no_grad():
-        for name, tensor in student.shared_parameters().items():
-            tensor.copy_(state["shared"][name])
+    Snapshot(state["parameters"], state["shared"]).to(device).put_into(student, anew=state["rows_changed"])
+    for name in still:  # as in an uninterrupted run, whose steps are others with a gradient more
+        student.parameters()[name].requires_grad_(False)
     if state["held"] is not None:
         student.held = state["held"].to(device)  # type: ignore[attr-defined]  # of a model that follows its splats
     optimizer = make_optimizer(student, config, pixel=1.0)  # the state holds the actual rates

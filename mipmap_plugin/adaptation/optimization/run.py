@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,19 +15,21 @@ from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, progr
 from mipmap_plugin.adaptation.following import Following
 from mipmap_plugin.adaptation.optimization.adam import Adam
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
+from mipmap_plugin.adaptation.optimization.costs import Costs
 from mipmap_plugin.adaptation.optimization.density import ScreenGradients
 from mipmap_plugin.adaptation.optimization.ending import End
-from mipmap_plugin.adaptation.optimization.estimate import Costs
+from mipmap_plugin.adaptation.optimization.losses import Detail
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.quickest import QuickestThreads
-from mipmap_plugin.adaptation.optimization.validation import Steering, Validation
-from mipmap_plugin.adaptation.pixel_size import pixel_size
+from mipmap_plugin.adaptation.optimization.steering import Steering
+from mipmap_plugin.adaptation.optimization.validation import Validation
+from mipmap_plugin.adaptation.pixel_size import target_pixel
 from mipmap_plugin.adaptation.renderers import SteppingRenderer, ViewsRenderer
 from mipmap_plugin.adaptation.target.resize import difference_from
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import SplatModel, count_of, places
+from mipmap_plugin.models.base import SplatModel, count_of
 
 # Number of views on which a student is compared with the base to assess a growth.
 AGREEMENT_VIEWS = 8
@@ -42,7 +45,7 @@ class Task:
     renders: Sequence[Callable[[Gaussians, Camera], Tensor]]  # splats and a camera of the new scale -> [h, w, 3]; of each viewer they are adapted for
     white_background: bool
     validation: Validation
-    detail: Callable[[Camera, Tensor], Tensor] | None = None  # a view and its image -> a further part of the loss
+    detail: Detail | None = None  # of a zoom-in with an upsampler
     max_splats: int = sys.maxsize  # growing stops at this number
     render_views: ViewsRenderer | None = None  # the same in one call, if the backend can
     render_to_step: SteppingRenderer | None = None  # the same if the backend can move the splats itself
@@ -55,23 +58,19 @@ class Task:
         """The camera of the new scale of each view."""
         return {view: view.zoomed(self.scale) for view in self.views}
 
-    def renderer(self, draw: int) -> Callable[[Gaussians, Camera], Tensor]:
-        """The function that renders the `draw`-th view since the beginning: the viewers take turns."""
-        return self.renders[draw % len(self.renders)]
-
     def images(self, gaussians: Gaussians, cameras: Sequence[Camera], draw: int) -> list[Tensor]:
-        """The images [h, w, 3] of the `draw`-th view since the beginning and of those after it."""
+        """The images [h, w, 3] of the `draw`-th view since the beginning and of those after it: the viewers take turns."""
         if self.render_views is not None:
             return self.render_views(gaussians, cameras, draw)
-        return [self.renderer(draw + number)(gaussians, camera) for number, camera in enumerate(cameras)]
+        return [self.renders[(draw + number) % len(self.renders)](gaussians, camera) for number, camera in enumerate(cameras)]
 
     def count(self, model: SplatModel) -> int:
         """The number of splats that the first view shows at the new scale."""
         return count_of(model, self.views[0], self.scale)
 
     def pixel(self, model: SplatModel) -> float:
-        """The size of a target pixel at the median splat of a model, in world units."""
-        return float(pixel_size(places(model, self.views[0]), self.views).median()) / self.scale
+        """The size of a pixel in world units, by which the means move."""
+        return target_pixel(model, self.views, self.scale)
 
     @torch.no_grad()
     def agreement(self, student: SplatModel, config: AdaptConfig) -> float:
@@ -92,13 +91,6 @@ class Trial:
     before: dict[str, Tensor] | None = None  # the parameters before a growth that has not been assessed yet
     passed: bool = False  # a growth has been assessed and kept
     undone_at: int | None = None  # the step at which a growth was undone
-
-    @classmethod
-    def begin(cls, student: SplatModel, task: Task, config: AdaptConfig) -> Trial | None:
-        """The trial of a run that begins with `student`; None if growth is never undone."""
-        if config.densify_on_trial and config.densify_gradient is not None:
-            return cls(task.agreement(student, config))
-        return None
 
 
 @dataclass
@@ -128,7 +120,8 @@ class Run:
         means = student.parameters()["means"]
         optimizer, watch = make_optimizer(student, config, task.pixel(student)), Stopwatch(seconds=spent)
         with watch:
-            trial, costs = Trial.begin(student, task, config), Costs(motion=lambda: task.follow.seconds, device=means.device)
+            trial = Trial(task.agreement(student, config)) if config.densify_on_trial and config.densify_gradient is not None else None
+            costs = Costs(motion=lambda: task.follow.seconds, device=means.device)
             quality = costs.check(lambda: task.validation.quality(student))
             steering = Steering.begin(student, quality.visible)
         first = CurvePoint(step=0, seconds=watch.read(), psnr_db=None, validation_db=quality.psnr, gaussians=task.count(student))
@@ -143,12 +136,16 @@ class Run:
         """What is gone of a time budget."""
         return self.watch.seconds + self.reserved
 
+    def budget_left(self, config: AdaptConfig) -> float:
+        """Seconds of a time budget that are left; infinity without one."""
+        return math.inf if config.time_budget_s is None else max(0.0, config.time_budget_s - self.seconds)
+
     def reason_to_stop(self, config: AdaptConfig) -> End | None:
         """Why it ends before its last step: the budget is spent, the target reached, or the knee passed; None to continue."""
-        if config.time_budget_s is not None and self.seconds >= config.time_budget_s:
+        if not self.budget_left(config):
             if self.step:
                 return End.TIME
-            return End.START if self.watch.seconds >= config.time_budget_s else End.CHOICE
+            return End.START if self.watch.seconds >= (config.time_budget_s or 0.0) else End.CHOICE
         psnrs = [point.psnr_db for point in self.curve if point.psnr_db is not None]
         if config.target_db is not None and psnrs and psnrs[-1] >= config.target_db:
             return End.TARGET

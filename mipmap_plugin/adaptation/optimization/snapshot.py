@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.splatting.bands import neighbors
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +52,11 @@ class Snapshot:
     def put_into(self, model: SplatModel, *, anew: bool = False) -> None:
         """Set `model`, a copy of the snapshot's model, to the snapshot: in its own leaves, unless the number of rows is another, or `anew`."""
         parameters = model.parameters()
+        # A GPU sums blend weights in any order, so that merging again may leave another number of splats than a saved run has.
         if anew or len(parameters["means"]) != len(self.rows["means"]):
-            model.replace_parameters({name: tensor.clone().requires_grad_() for name, tensor in self.rows.items()})
+            copies = neighbors(self.rows)  # of colors, which are most of the memory
+            copies |= {name: tensor.clone() for name, tensor in self.rows.items() if copies[name] is tensor}
+            model.replace_parameters({name: tensor.requires_grad_() for name, tensor in copies.items()})
         else:
             for name, tensor in parameters.items():
                 tensor.copy_(self.rows[name])

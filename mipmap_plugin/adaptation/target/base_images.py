@@ -36,12 +36,12 @@ class BaseImages:
 
         It is clamped, as a display does, before anybody resizes it: unclamped highlights would bleed into their neighbors (-3 dB at x1/8).
         """
-        return self._store((facts(view), fraction), lambda: self._render(view, fraction))
+        return self._store((facts(view), fraction), lambda: self._drawn([view], fraction)[0])
 
     def of_one_size(self, views: Sequence[Camera], fraction: float = 1.0) -> Tensor:
         """The same of several views whose images are of one size, [V, H, W, 3]: those that are not known are drawn in one call."""
         keys = [(facts(view), fraction) for view in views]
-        return self._store.of_one_size(keys, lambda numbers: self._render_together([views[number] for number in numbers], fraction))
+        return self._store.of_one_size(keys, lambda numbers: self._drawn([views[number] for number in numbers], fraction))
 
     @property
     def draws_together(self) -> bool:
@@ -59,14 +59,11 @@ class BaseImages:
         self._store.keep_only(lambda key: key[0] in kept)
 
     @torch.no_grad()
-    def _render(self, view: Camera, fraction: float) -> Tensor:
-        camera, effects = self._shot(view, fraction)
-        return self.backend.render(self._splats(camera), camera, effects).image.clamp(0, 1)
-
-    @torch.no_grad()
-    def _render_together(self, views: Sequence[Camera], fraction: float) -> Tensor:
+    def _drawn(self, views: Sequence[Camera], fraction: float) -> Tensor:
+        """The images of views of one size, [V, H, W, 3], in one call if they are several."""
         shots = [self._shot(view, fraction) for view in views]
-        drawn = cast(Any, self.backend).render_views(self._splats(shots[0][0]), shots)
+        splats, backend = self._splats(shots[0][0]), cast(Any, self.backend)
+        drawn = backend.render_views(splats, shots) if len(shots) > 1 else [backend.render(splats, *shots[0])]
         return torch.stack([rendered.image for rendered in drawn]).clamp_(0, 1)
 
     def _shot(self, view: Camera, fraction: float) -> tuple[Camera, Effects]:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.spreading import Halves, places, spread
+from mipmap_plugin.adaptation.schedule import halves_of, poses, spread
 from mipmap_plugin.adaptation.target.image_store import moved_off_full_gpu
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.structure import similarity
@@ -59,7 +59,7 @@ class DetailLoss:
 
         Each may take seconds. If there is no time for all, those that are upsampled look from all sides.
         """
-        order = spread(Halves.of(range(len(views)), places(views)), torch.Generator().manual_seed(self._config.seed))
+        order = spread(halves_of(range(len(views)), poses(views)), torch.Generator().manual_seed(self._config.seed))
         device, done = self._truth(views[order[0]]).device, []
         began = now(device)
         for number in Bar(order, desc=f"upsampling x{self._scale:g}", unit="view"):

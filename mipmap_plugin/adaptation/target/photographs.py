@@ -86,7 +86,8 @@ def at_density_of(cameras: Sequence[Camera], base: Sequence[Camera]) -> list[Cam
         resized = camera.resized(*(max(1, round(side)) for side in sides))
         if camera.index is None and len(own) == 1 and view.split == camera.split:
             resized = replace(resized, index=view.index)
-        return replace(resized, cx=resized.width / 2, cy=resized.height / 2) if _is_centered(view) else resized
+        centered = math.isclose(2 * view.cx, view.width) and math.isclose(2 * view.cy, view.height)  # but for rounding
+        return replace(resized, cx=resized.width / 2, cy=resized.height / 2) if centered else resized
 
     return [*map(at_density, cameras)]
 
@@ -94,11 +95,6 @@ def at_density_of(cameras: Sequence[Camera], base: Sequence[Camera]) -> list[Cam
 def names_of(camera: Camera) -> tuple[str, ...]:
     """The names by which a view and its photograph are the same: with folders and, for 3DGS left these out until October 2024, without."""
     return tuple(dict.fromkeys((without_suffix(camera.name), stem_of(camera.name))))
-
-
-def _is_centered(camera: Camera) -> bool:
-    """Whether the principal point is in the middle of the picture, but for rounding."""
-    return math.isclose(2 * camera.cx, camera.width) and math.isclose(2 * camera.cy, camera.height)
 
 
 class MostSimilar:

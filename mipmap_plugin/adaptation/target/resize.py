@@ -28,8 +28,8 @@ def resize(image: Tensor, size: tuple[int, int], method: str) -> Tensor:
     """
     if tuple(image.shape[:2]) == tuple(size):
         return image
-    if method == "box":
-        _check_box(image, size)
+    if method == "box" and any(old % new for old, new in zip(image.shape[:2], size, strict=True)):
+        raise SettingsError(f"box: {list(image.shape[:2])} px is not a whole multiple of {list(size)} px; use area")
     return resample(image, size, method)
 
 
@@ -43,12 +43,6 @@ def resize_all(images: Tensor, size: tuple[int, int], method: str) -> Tensor:
     channels = resize(images.permute(1, 2, 0, 3).flatten(2), size, method)
     resized: Tensor = channels.unflatten(2, images.shape[::3]).permute(2, 0, 1, 3).contiguous()
     return resized
-
-
-def _check_box(image: Tensor, size: tuple[int, int]) -> None:
-    old = list(image.shape[:2])
-    if any(pixels % new for pixels, new in zip(old, size, strict=True)):
-        raise SettingsError(f"box: {old} px is not a whole multiple of {list(size)} px; use area")
 
 
 def fitting(config: AdaptConfig, base: Effects, views: Sequence[Camera], scale: float) -> AdaptConfig:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.amount import affordable_for
 from mipmap_plugin.adaptation.pixel_size import pixel_size, seen_pixel_size
-from mipmap_plugin.adaptation.seeing import seeing
+from mipmap_plugin.adaptation.shown import seeing
 from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
