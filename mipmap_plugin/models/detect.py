@@ -166,7 +166,8 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
     if iteration is not None:
         raise CheckpointError(f"{folder} has no point_cloud/iteration_{iteration}; give the model folder above it, or no iteration")
     files = sorted(folder.iterdir())
-    clouds = [file for file in files if file.suffix.lower() == ".ply"] or [file for file in files if _is_exchanged(file)]
+    clouds = [file for file in files if file.suffix.lower() == ".ply"]
+    clouds = clouds or [file for file in files if file.suffix.lower() in EXCHANGED and file.is_file()]
     clouds = [cloud for cloud in clouds if not cloud.with_name(cloud.name + REPORT).exists()] or clouds  # no adaptations, where there is a base
     if len(clouds) > 1 and folder / "point_cloud.ply" in clouds:
         clouds = [folder / "point_cloud.ply"]
@@ -180,10 +181,6 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
         raise CheckpointError(f"{folder} lies above its checkpoint{'s' * (len(below) > 1)}; give {' or '.join(map(str, below[:NAMED]))}{more}")
     content = f"{len(clouds)} files of splats ({some})" if clouds else f"no point_cloud folder and no file of splats{_instead(folder)}"
     raise CheckpointError(f"{folder} holds {content}; give one file, or a model folder with point_cloud/iteration_<N>")
-
-
-def _is_exchanged(file: Path) -> bool:
-    return file.suffix.lower() in EXCHANGED and file.is_file()
 
 
 def _instead(folder: Path) -> str:
