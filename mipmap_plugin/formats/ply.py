@@ -161,7 +161,10 @@ def _parsed(path: Path, lines: list[bytes], body: int) -> Header:
                 if form not in BYTE_ORDER:
                     raise ValueError(form)
             elif keyword == "element":
-                elements.append(Element(rest.split()[0], _count(rest.split()[1]), ()))
+                name, count = rest.split()[:2]
+                elements.append(Element(name, int(count), ()))
+                if elements[-1].count < 0:
+                    raise ValueError(count)
             elif keyword == "property":
                 elements[-1] = _with_property(elements[-1], rest.split())
             elif keyword in ("comment", "obj_info"):
@@ -188,13 +191,6 @@ def _with_property(element: Element, words: list[str]) -> Element:
     if name in element.names:
         raise _Fault("the second property of this name")
     return replace(element, properties=(*element.properties, (name, " ".join(kind))))
-
-
-def _count(word: str) -> int:
-    count = int(word)
-    if count < 0:
-        raise ValueError(word)
-    return count
 
 
 def _sized(path: Path, header: Header, size: int) -> Header:

@@ -213,7 +213,7 @@ def _run(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str
 def _settle_frame(tool: Sequence[str], file: Path, ply: Path) -> None:
     """Turn the splats of a PLY that were, or will be, turned on their way from or to `file`."""
     if is_spz(file) and TURNS_SPZ[0] <= _version(tool) < TURNS_SPZ[1]:
-        from mipmap_plugin.formats.half_turn import half_turned  # and NumPy, without which options are read
+        from mipmap_plugin.formats.spz import half_turned  # and NumPy, without which options are read
 
         half_turned(ply)
 
