@@ -105,6 +105,15 @@ def notes_on(extras: Mapping[str, np.ndarray]) -> list[str]:
     return notes
 
 
+def notes_on_types(columns: Mapping[str, np.ndarray]) -> list[str]:
+    """What is said of columns in other types, or of another meaning, than 3DGS gives them, in sentences."""
+    whole = _whole_opacities(columns)
+    notes = [f"its opacities are whole numbers ({whole}), read as fractions of the largest"] if whole else []
+    notes += ["its columns have 16 bits, read as half-precision floats"] if _holds_halves(columns) else []
+    notes += [f"its colors are floats above {BRIGHTEST}, read as numbers in 0..255"] if has_bright_colors(columns) else []
+    return notes + second_colors(columns)
+
+
 def second_colors(columns: Iterable[str]) -> list[str]:
     """A note on colors besides those of the harmonics, as Blender writes them; none without both."""
     if not {DC[0], *RGB} <= set(columns):
@@ -123,14 +132,14 @@ def numbered(columns: Iterable[str], prefix: str) -> tuple[str, ...]:
     return tuple(sorted(names, key=lambda name: int(name.removeprefix(prefix))))
 
 
-def holds_halves(columns: Mapping[str, np.ndarray]) -> bool:
+def _holds_halves(columns: Mapping[str, np.ndarray]) -> bool:
     """Whether these are half-precision floats, which PLY has no name for, so that exporters write ushort: log scales are no whole numbers."""
     sizes = [columns[name].dtype for name in (*SCALE, *QUATERNION) if name in columns]
     return bool(sizes) and all(dtype.kind == "u" and dtype.itemsize == 2 for dtype in sizes)
 
 
 def _with_halves(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
-    if not holds_halves(columns):
+    if not _holds_halves(columns):
         return columns
     known = {*POSITION, *DC, "opacity", *SCALE, *QUATERNION, *rest_names(columns)}
     halves = {name for name, column in columns.items() if name in known and column.dtype.str[1:] == "u2"}
@@ -154,15 +163,15 @@ def has_bright_colors(columns: Mapping[str, np.ndarray]) -> bool:
 
 def _with_logits(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
     """The columns with logits of opacities that are whole numbers of full range, as of point clouds: logits are none."""
-    if not whole_opacities(columns):
+    if not _whole_opacities(columns):
         return columns
     opacities = _unit(columns["opacity"]).clip(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
     return {**columns, "opacity": np.log(opacities / (1 - opacities))}
 
 
-def whole_opacities(columns: Mapping[str, np.ndarray]) -> str:
+def _whole_opacities(columns: Mapping[str, np.ndarray]) -> str:
     """The type of opacities that are whole numbers; "" if they are floats, or missing."""
-    whole = "opacity" in columns and columns["opacity"].dtype.kind in "iu" and not holds_halves(columns)
+    whole = "opacity" in columns and columns["opacity"].dtype.kind in "iu" and not _holds_halves(columns)
     return columns["opacity"].dtype.name if whole else ""
 
 

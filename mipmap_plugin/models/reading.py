@@ -7,16 +7,7 @@ from pathlib import Path
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import recorded_filter, render_mode
-from mipmap_plugin.models.columns import (
-    BRIGHTEST,
-    FILTER_3D,
-    extra_columns,
-    has_bright_colors,
-    holds_halves,
-    notes_on,
-    second_colors,
-    whole_opacities,
-)
+from mipmap_plugin.models.columns import FILTER_3D, extra_columns, notes_on, notes_on_types
 from mipmap_plugin.models.detect import Checkpoint, detect_as
 from mipmap_plugin.models.exposure import read_exposures
 from mipmap_plugin.models.health import without_invalid
@@ -44,11 +35,7 @@ def read_splats(checkpoint: Checkpoint, kind: type[Model]) -> Model:
     trained = trained_scale(options, ply.comments)
     screen_filter = trained.screen_filter if recorded_filter(ply.comments) else render_mode(ply.comments)
     origin = Origin(path, sha256(path), folder, checkpoint.iteration, ply.comments, extras, read_exposures(folder))
-    model = kind(parameters, trained, origin, [*checkpoint.notes, *ply.notes, *notes])
-    model.notes += [f"its opacities are whole numbers ({whole}), read as fractions of the largest"] if (whole := whole_opacities(ply.columns)) else []
-    model.notes += ["its columns have 16 bits, read as half-precision floats"] if holds_halves(ply.columns) else []
-    model.notes += [f"its colors are floats above {BRIGHTEST}, read as numbers in 0..255"] if has_bright_colors(ply.columns) else []
-    model.notes += second_colors(ply.columns)
+    model = kind(parameters, trained, origin, [*checkpoint.notes, *ply.notes, *notes, *notes_on_types(ply.columns)])
     del ply  # as large as the model, and no longer needed
     has_filter = FILTER_3D in extras  # whose family knows its screen filter
     taken_as_classic = screen_filter is None and trained.screen_filter == "classic" and not has_filter
