@@ -10,7 +10,7 @@ import torch
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.splat_transform import EXCHANGE, as_ply
 from mipmap_plugin.models.columns import OPACITY_MARGIN
-from mipmap_plugin.models.detect import detect
+from mipmap_plugin.models.detect import detect, detect_as
 from mipmap_plugin.models.families import find_family
 from mipmap_plugin.models.family import Files
 from mipmap_plugin.models.reading import read_splats
@@ -19,11 +19,9 @@ from mipmap_plugin.models.vanilla import VanillaModel
 
 def load_exchanged(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
     """Load an SPZ, SOG (a file or a folder), KSPLAT, SPLAT or compressed PLY. Raises CheckpointError."""
-    file = detect(path, iteration=iteration).path
+    file = detect_as(path, ("exchange",), iteration=iteration).path
     files = Files(file)
     kind = "compressed" if files.compressed else files.kind
-    if kind not in EXCHANGE:
-        raise CheckpointError(f"{file} is in no exchange format; give an SPZ, SOG, KSPLAT, SPLAT or compressed PLY")
     with as_ply(file, kind) as ply:
         checkpoint = detect(ply)
         if checkpoint.family != "3dgs":

@@ -79,7 +79,8 @@ class SplatfactoHost:
     def holds(self, path: Path) -> str | None:
         if path.suffix != ".ckpt":
             return PLACE
-        _refuse_unreadable_name(path)
+        if path.parent.name == PLACE and not re.fullmatch(FILE, path.name):
+            raise OutputError(f"{path}: nerfstudio reads the step from every name in {PLACE}, and would stop at this one; choose another folder")
         return None
 
     def as_trained(self, cameras: Sequence[Camera], capture: Capture, means: Tensor) -> list[Camera]:
@@ -224,8 +225,3 @@ def _shrunk(camera: Camera, factor: float) -> Camera:
     size = dict(width=max(1, int(camera.width / factor)), height=max(1, int(camera.height / factor)))
     lens = {name: getattr(camera, name) / factor for name in ("fx", "fy", "cx", "cy")}
     return replace(camera, **size, **lens)  # type: ignore[arg-type]
-
-
-def _refuse_unreadable_name(path: Path) -> None:
-    if path.parent.name == PLACE and not re.fullmatch(FILE, path.name):
-        raise OutputError(f"{path}: nerfstudio reads the step from every name in {PLACE}, and would stop at this one; choose another folder")
