@@ -1,16 +1,20 @@
-"""Splats read from a PLY of 3DGS, or of a family with the same columns, with what its header and the model folder around it say."""
+"""Splats read from a PLY of 3DGS, or of a family with the same columns, with what its header and its model folder say, and without invalid ones."""
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
+from torch import Tensor
+
+from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import recorded_filter, render_mode
 from mipmap_plugin.models.columns import FILTER_3D, extra_columns, notes_on, notes_on_types
 from mipmap_plugin.models.detect import Checkpoint, detect_as
 from mipmap_plugin.models.exposure import read_exposures
-from mipmap_plugin.models.health import without_invalid
+from mipmap_plugin.models.health import dropped, examine, refuse_few, why_invalid
 from mipmap_plugin.models.inria_folder import companion_notes, read_options, trained_scale
 from mipmap_plugin.models.vanilla import Model, Origin, VanillaModel
 
@@ -45,3 +49,28 @@ def read_splats(checkpoint: Checkpoint, kind: type[Model]) -> Model:
     model.notes += notes_on(extras)
     model.notes += [FUSED] if "fused" in path.stem and taken_as_classic else []
     return without_invalid(model)
+
+
+def without_invalid(model: Model) -> Model:
+    """The model without splats that are not finite once activated, with a note. Raises CheckpointError if none or few are left (`refuse_few`),
+    and for a file without any.
+
+    Once for each model it warns of what is doubtful (`Health.doubts`), such as positions that float32 does not hold: a file of doubles loses them
+    only here.
+    """
+    health = examine(model)
+    if model.source is not None and not health.splats:
+        raise CheckpointError(f"{model.source} holds no splats; export it again")
+    refuse_few(health.invalid, model.source)
+    for doubt in health.doubts():
+        if doubt not in model.notes:
+            warnings.warn(f"{model.source or 'this model'}: {doubt}", stacklevel=2)
+            model = model.noted(doubt)
+    if not health.invalid.any():
+        return model
+    return drop(model, health.invalid, "; ".join(why_invalid(model, health.invalid)), model.source)
+
+
+def drop(model: Model, mask: Tensor, why: str, source: Path | str | None) -> Model:
+    """A new model without the rows where `mask` [N] is True, with a note and a warning of their number. `source`: where they come from."""
+    return model.keep_rows(~mask).noted(dropped(mask, "splats", why, source))

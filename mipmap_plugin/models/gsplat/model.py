@@ -22,9 +22,9 @@ from mipmap_plugin.formats.yaml_scalars import read_scalars, with_scalar
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.gsplat.frame import normalized_frame
-from mipmap_plugin.models.health import without_invalid
 from mipmap_plugin.models.hosts import Capture, held_out
 from mipmap_plugin.models.places import GSPLAT
+from mipmap_plugin.models.reading import without_invalid
 from mipmap_plugin.models.surfels import NOTE as FLAT_NOTE
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.models.tagged import as_tagged
