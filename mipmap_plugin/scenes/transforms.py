@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import OPENGL_TO_OPENCV, Camera
-from mipmap_plugin.errors import SceneError
+from mipmap_plugin.errors import SceneError, plural
 from mipmap_plugin.formats.images import image_size
 from mipmap_plugin.formats.json_file import ROTATION_TOLERANCE, numbers, pixels, positive, present, read_json, rotation
 from mipmap_plugin.scenes.base import ABSENT, MASKED, Scene, note_on_shapes, other_shape
@@ -111,16 +111,8 @@ def _as_trained(views: list[View], cfg: dict[str, Any]) -> list[View]:
     return trained
 
 
-def _counted(absent: int) -> str:
-    return f"{absent} listed images are" if absent > 1 else "1 listed image is"
-
-
-def _left_out(unsized: int) -> str:
-    """What becomes of the cameras of photographs that are absent; "" if all stay."""
-    if not unsized:
-        return ""
-    cameras = f"{unsized} cameras are" if unsized > 1 else "1 camera is"
-    return f"; {cameras} left out because the file has no w and h"
+def _are(count: int, noun: str) -> str:
+    return f"{plural(count, noun)} {'is' if count == 1 else 'are'}"
 
 
 def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View], list[PurePosixPath], list[str]]:
@@ -157,7 +149,8 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
             views.append((lens.straightened(camera) if lens and can_undistort() else camera, image, lens))
             places.append(place_of(listed))
     unsized = absent - sum(image is None for _, image, _ in views)
-    notes = [f"{file.name}: {_counted(absent)} {ABSENT}{_left_out(unsized)}"] if absent else []
+    left_out = f"; {_are(unsized, 'camera')} left out because the file has no w and h" if unsized else ""
+    notes = [f"{file.name}: {_are(absent, 'listed image')} {ABSENT}{left_out}"] if absent else []
     notes += note_on_shapes(shapes)
     if copies:
         notes.append(f"{file.name}: the images that it lists are not there, and the photographs are those of {copies}")
