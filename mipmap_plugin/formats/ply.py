@@ -132,7 +132,8 @@ def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Ite
     dtype = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
     count = len(next(iter(columns.values())))
     declared = PlyElement.describe(np.broadcast_to(np.zeros((), dtype), (count,)), "vertex")
-    header = PlyData([declared], byte_order="<", comments=[_one_ascii_line(text) for text in comments]).header + "\n"
+    lines = [" ".join(text.splitlines()).encode("ascii", "backslashreplace").decode() for text in comments]
+    header = PlyData([declared], byte_order="<", comments=lines).header + "\n"
     if len(header) >= MAX_HEADER:
         raise SettingsError(f"{path}: comments and provenance take {len(header):,} bytes, but a PLY header holds {MAX_HEADER:,}; shorten them")
     with new_file(path, overwrite) as temporary, temporary.open("xb") as file:
@@ -245,7 +246,3 @@ def _read_through_plyfile(path: Path, header: Header, wanted: Element) -> np.nda
         return rows
     except (PlyParseError, ValueError, OverflowError) as error:
         raise CheckpointError(f"{path} is damaged or truncated ({error}); download or export it again") from error
-
-
-def _one_ascii_line(text: str) -> str:
-    return " ".join(text.splitlines()).encode("ascii", "backslashreplace").decode()

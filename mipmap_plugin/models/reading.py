@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from torch import Tensor
@@ -11,6 +13,7 @@ from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import recorded_filter, render_mode
+from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import FILTER_3D, extra_columns, notes_on, notes_on_types
 from mipmap_plugin.models.detect import Checkpoint, detect_as
 from mipmap_plugin.models.exposure import read_exposures
@@ -74,3 +77,9 @@ def without_invalid(model: Model) -> Model:
 def drop(model: Model, mask: Tensor, why: str, source: Path | str | None) -> Model:
     """A new model without the rows where `mask` [N] is True, with a note and a warning of their number. `source`: where they come from."""
     return model.keep_rows(~mask).noted(dropped(mask, "splats", why, source))
+
+
+def as_tagged(trained: TrainedScale, comments: Sequence[str]) -> TrainedScale:
+    """`trained` with the screen filter that the comments of an adapted file of another project name (`tags.with_tags`), if they name one."""
+    name, eps2d = recorded_filter(comments) or (render_mode(comments) or trained.screen_filter, trained.eps2d)
+    return replace(trained, screen_filter=name, eps2d=eps2d)

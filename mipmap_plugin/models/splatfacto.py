@@ -25,8 +25,7 @@ from mipmap_plugin.models.columns import OPACITY_MARGIN
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.hosts import Capture, as_file, held_out
 from mipmap_plugin.models.places import SPLATFACTO
-from mipmap_plugin.models.reading import without_invalid
-from mipmap_plugin.models.tagged import as_tagged
+from mipmap_plugin.models.reading import as_tagged, without_invalid
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.splatting.harmonics import C0
 

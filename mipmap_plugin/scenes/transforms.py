@@ -193,36 +193,23 @@ def _camera(values: Mapping[str, Any], size: tuple[int, int], name: str, split: 
     fy = _focal(values, "y", height, where) or fx
     cx, cy = principal_point(values, size, where)
     time = numbers(values["time"], (), f"{where}, time").item() if values.get("time") is not None else None
-    return Camera(width, height, fx, fy, cx, cy, _viewmat(values, where), name, split, time)
+    pose = _pose(present(values, "transform_matrix", where), f"{where}, transform_matrix", of_camera=True)
+    return Camera(width, height, fx, fy, cx, cy, viewmat_from_opengl(pose), name, split, time)
 
 
-def _viewmat(values: Mapping[str, Any], where: str) -> Tensor:
-    pose, where = present(values, "transform_matrix", where), f"{where}, transform_matrix"
-    return viewmat_from_opengl(_pose(_unscaled(pose, where), where))
+def _pose(value: Any, where: str, *, of_camera: bool = False) -> Tensor:
+    """A rotation and a translation as [4, 4] float64. Raises SceneError, beginning with `where`.
 
-
-def _unscaled(value: Any, where: str) -> list[list[float]]:
-    """A camera's pose without the scale of its axes: in a modeling program a camera has a size, which no picture shows."""
-    rows = numbers(_upper(value), (3, 4), where)
-    determinant = torch.linalg.det(rows[:, :3]).item()
-    if determinant > 0 and abs(determinant - 1) > ROTATION_TOLERANCE:
-        rows[:, :3] /= determinant ** (1 / 3)
-    listed: list[list[float]] = rows.tolist()
-    return listed
-
-
-def _pose(value: Any, where: str) -> Tensor:
-    """A rotation and a translation as [4, 4] float64. Raises SceneError, beginning with `where`."""
-    upper = numbers(_upper(value), (3, 4), where)
+    `of_camera`: a scale of its axes is left out. In a modeling program a camera has a size, which no picture shows.
+    """
+    upper = numbers(value[:3] if isinstance(value, list) else value, (3, 4), where)  # the last row is 0 0 0 1, and some files leave it out
+    determinant = torch.linalg.det(upper[:, :3]).item()
+    if of_camera and determinant > 0 and abs(determinant - 1) > ROTATION_TOLERANCE:
+        upper[:, :3] /= determinant ** (1 / 3)
     rotation(upper[:, :3].tolist(), where)
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3] = upper
     return pose
-
-
-def _upper(value: Any) -> Any:
-    """The first three rows of a pose: the last one is 0 0 0 1, and some files leave it out."""
-    return value[:3] if isinstance(value, list) else value
 
 
 def _focal(values: Mapping[str, Any], axis: str, size: int, where: str) -> float | None:

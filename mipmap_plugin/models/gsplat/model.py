@@ -24,10 +24,9 @@ from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.gsplat.frame import normalized_frame
 from mipmap_plugin.models.hosts import Capture, held_out
 from mipmap_plugin.models.places import GSPLAT
-from mipmap_plugin.models.reading import without_invalid
+from mipmap_plugin.models.reading import as_tagged, without_invalid
 from mipmap_plugin.models.surfels import NOTE as FLAT_NOTE
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
-from mipmap_plugin.models.tagged import as_tagged
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 
 PLACE, FILE = GSPLAT
