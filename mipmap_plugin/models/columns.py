@@ -32,6 +32,7 @@ DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 QUATERNION = ("rot_0", "rot_1", "rot_2", "rot_3")
 RGB, ALPHA = ("red", "green", "blue"), "alpha"
+NEEDED = (*POSITION, *DC, "opacity", *SCALE, *QUATERNION)  # without which a file is none of 3DGS
 FILTER_3D = "filter_3D"  # of Mip-Splatting and its successors (`models.mip`)
 
 
@@ -42,8 +43,7 @@ def to_parameters(columns: Mapping[str, np.ndarray], path: Path) -> dict[str, Te
     Raises CheckpointError for missing columns and for a number of f_rest columns that fits no SH degree.
     """
     columns = _with_logits(_with_dc(_with_halves(columns)))
-    missing = [name for name in (*POSITION, *DC, "opacity", *SCALE, *QUATERNION) if name not in columns]
-    if missing:
+    if missing := [name for name in NEEDED if name not in columns]:
         raise CheckpointError(f"{path} is no 3DGS checkpoint: it lacks the columns {', '.join(missing)}; export it again with them")
     rest = rest_names(columns)
     if len(rest) not in SH_DEGREES:
@@ -89,7 +89,7 @@ def extra_names(columns: Mapping[str, np.ndarray]) -> list[str]:
 
     Not a second set of colors: they would no longer be those of the splats, and some viewers prefer them (`second_colors`).
     """
-    known = {*POSITION, *DC, "opacity", *SCALE, *QUATERNION, *rest_names(columns)}
+    known = {*NEEDED, *rest_names(columns)}
     known |= set() if any(columns[name].any() for name in NORMAL if name in columns) else set(NORMAL)
     known |= {*RGB, ALPHA} if all(name in columns for name in RGB) else set()
     return [name for name in columns if name not in known]
@@ -141,7 +141,7 @@ def _holds_halves(columns: Mapping[str, np.ndarray]) -> bool:
 def _with_halves(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
     if not _holds_halves(columns):
         return columns
-    known = {*POSITION, *DC, "opacity", *SCALE, *QUATERNION, *rest_names(columns)}
+    known = {*NEEDED, *rest_names(columns)}
     halves = {name for name, column in columns.items() if name in known and column.dtype.str[1:] == "u2"}
     return {name: column.view(f"{column.dtype.str[0]}f2") if name in halves else column for name, column in columns.items()}
 

@@ -29,7 +29,7 @@ from mipmap_plugin.models.columns import QUATERNION
 from mipmap_plugin.models.health import LARGEST
 from mipmap_plugin.models.inria_folder import write_folder
 from mipmap_plugin.models.outputs import finite, refuse_parts
-from mipmap_plugin.models.raw import MIN_SCALE
+from mipmap_plugin.models.raw import MIN_SCALE, moved
 from mipmap_plugin.splatting.rotations import unit_quaternions
 
 # Views sampled for the opacities of anchors, and for reshaping: the networks vary slowly with the direction.
@@ -95,7 +95,7 @@ class AnchorModel(ABC):
 
     def to(self, device: torch.device | str) -> AnchorModel:
         """A copy on another device, which requires gradients where this one does."""
-        return self._map(lambda tensor: tensor.detach().to(device, copy=True).requires_grad_(tensor.requires_grad))
+        return self._map(partial(moved, device=device))
 
     def replace_parameters(self, parameters: dict[str, Tensor]) -> None:
         """Use these tensors themselves as leaves, as an optimizer requires. Raises ShapeError."""
