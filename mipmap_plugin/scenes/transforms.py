@@ -125,9 +125,10 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
     views: list[View] = []
     places: list[PurePosixPath] = []
     shapes: list[str] = []
-    absent, passed_over, trained = 0, 0, {place_of(str(name)) for name in names} if isinstance(names := data.get("train_filenames"), list) else None
-    tests = tests if isinstance(tests := data.get("test_frames"), list) else []  # of ScanNet++
-    every = [*frames, *tests]
+    absent = passed_over = 0
+    names, tests = data.get("train_filenames"), data.get("test_frames")  # of nerfstudio, and of ScanNet++
+    trained = {place_of(str(name)) for name in names} if isinstance(names, list) else None
+    every = [*frames, *(tests if isinstance(tests, list) else [])]
     images, copies = listed_images(file, [_listed(frame, f"{file}, frame {index}") for index, frame in enumerate(every)])
     for index, (frame, image) in enumerate(zip(every, images, strict=True)):
         where, listed = f"{file}, frame {index}", str(frame["file_path"])
@@ -137,17 +138,19 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
         image = None if copies and not stated else image  # a copy does not tell the size that the focal length is of
         absent += image is None
         actual = stated if stated and (copies or not image) else image and image_size(image)  # the image itself may have been shrunk since
-        if actual:
-            name = image.stem if image else stem_of(listed)
-            if trained is not None or index >= len(frames):
-                split = "train" if trained is not None and place_of(listed) in trained else "test"
-            if stated and image:
-                shapes.append(other_shape(stated, image, f"{where} ({name})"))
-            model = _lens_model(values, f"{where} ({name})")
-            camera = _camera(values, stated or actual, name, split, f"{where} ({name})").resized(*actual)
-            lens = _lens(values, model, camera, f"{where} ({name})")
-            views.append((lens.straightened(camera) if lens and can_undistort() else camera, image, lens))
-            places.append(place_of(listed))
+        if not actual:
+            continue
+        name = image.stem if image else stem_of(listed)
+        where = f"{where} ({name})"
+        if trained is not None or index >= len(frames):
+            split = "train" if trained is not None and place_of(listed) in trained else "test"
+        if stated and image:
+            shapes.append(other_shape(stated, image, where))
+        model = _lens_model(values, where)
+        camera = _camera(values, stated or actual, name, split, where).resized(*actual)
+        lens = _lens(values, model, camera, where)
+        views.append((lens.straightened(camera) if lens and can_undistort() else camera, image, lens))
+        places.append(place_of(listed))
     unsized = absent - sum(image is None for _, image, _ in views)
     left_out = f"; {_are(unsized, 'camera')} left out because the file has no w and h" if unsized else ""
     notes = [f"{file.name}: {_are(absent, 'listed image')} {ABSENT}{left_out}"] if absent else []
