@@ -142,7 +142,7 @@ BUILT_IN = (
     family("gltf", "glTF (KHR_gaussian_splatting)", where(lambda files: files.kind == "glb", "its first bytes"), load=f"{LOADERS}.gltf:load_gltf"),
     family(
         "zipped", "PLY in a zip archive", where(lambda files: files.kind == "zip" and only_ply(files.path), "a zip archive of one PLY"),
-        load=f"{LOADERS}.zipped:load_zipped",
+        load=f"{LOADERS}.exchanged:load_zipped",
     ),
     # Recognized in order to be refused with a clear message.
     family(
