@@ -95,8 +95,8 @@ def _dotted(version: Sequence[int]) -> str:
     return ".".join(map(str, version))
 
 
-def refuse_as_folder(path: Path) -> None:
-    """Raise SettingsError for a folder whose name has the suffix of an exchange format, or of another file."""
+def refuse_ending(path: Path) -> None:
+    """Raise SettingsError for an output whose name has the suffix of an exchange format, or of another kind of file."""
     names = {ending: name for name, ending in EXCHANGE.values()}
     for ending in (*names, *OF_FILES):
         if path.name.lower().endswith(ending):

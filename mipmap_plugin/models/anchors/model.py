@@ -18,6 +18,7 @@ from mipmap_plugin.effects import Effect
 from mipmap_plugin.errors import ShapeError
 from mipmap_plugin.formats.atomic import together
 from mipmap_plugin.formats.ply import write_ply
+from mipmap_plugin.formats.splat_transform import refuse_ending
 from mipmap_plugin.formats.tags import with_tags
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.anchors.decoding import Anchors, decode
@@ -163,10 +164,11 @@ class AnchorModel(ABC):
         return write_folder(path, self.folder, cfg_args, self._read.origin.iteration, overwrite, fill)
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
-        """Check `path` as `save` would. `networks_move`: the networks will change. Raises OutputExists, OutputError."""
+        """Check `path` as `save` would. `networks_move`: the networks will change. Raises OutputExists, OutputError, SettingsError."""
         lone = path.suffix.lower() == ".ply"
         refuse_parts(path, overwrite, self.source, self.folder, None if lone else "point_cloud")
         if lone:
+            refuse_ending(path)  # whose name may end in .compressed.ply
             companions = packed(self._weights, self._read.weights, self._read.companions)
             refuse_others(path, dict.fromkeys(companions, b"") if networks_move else companions, self.source, overwrite)
 
