@@ -22,7 +22,7 @@ from mipmap_plugin.models import detect, load_model
 from mipmap_plugin.models.adapted_name import adapted_name
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
-from mipmap_plugin.splatting.harmonics import basis
+from mipmap_plugin.splatting.harmonics import basis, rotated
 from mipmap_plugin.splatting.projection import axes_of
 
 HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))  # from y up to a PLY's frame, about z
@@ -68,6 +68,13 @@ def test_splats_are_turned_to_the_frame_of_a_ply(tmp_path, degree):
     model = load_model(gltf_files.glb(tmp_path / "a.glb", splats))
     assert (model.sh_degree, model.source, len(model.digest)) == (degree, tmp_path / "a.glb", 64)
     assert_moved(model.gaussians(), splats, HALF_TURN)
+
+
+def test_half_a_turn_changes_the_signs_of_harmonics_and_not_a_digit():
+    sh = torch.randn(5, 16, 3, generator=torch.Generator().manual_seed(0))
+    sh[:, 9:] = 0
+    turned = rotated(sh, HALF_TURN)
+    assert torch.equal(turned.abs(), sh.abs()) and torch.equal(rotated(turned, HALF_TURN), sh)
 
 
 def test_nodes_turn_scale_and_move_splats(tmp_path):

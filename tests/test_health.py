@@ -13,9 +13,9 @@ from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.health import ACTIVATED, LINEAR, drop, examine, units
+from mipmap_plugin.models.health import ACTIVATED, LINEAR, examine, units
 from mipmap_plugin.models.live import adopt
-from mipmap_plugin.models.reading import load_vanilla
+from mipmap_plugin.models.reading import drop, load_vanilla
 from mipmap_plugin.models.vanilla import VanillaModel
 
 FIELDS = {"means": "x", "scales": "scale_1", "quats": "rot_2", "opacities": "opacity", "sh0": "f_dc_1", "shN": "f_rest_7"}
@@ -207,7 +207,7 @@ def test_places_that_float32_holds_well_enough_are_not_told_of():
     near.parameters()["means"].add_(1000)
     assert examine(near).rounded == examine(points).rounded == 0  # nor is the place of a point rounded, in an image of all
     stray = examine(spoiled("means", 0, 1e9))
-    assert stray.rounded == 1 and not stray.coarse()  # floaters lie anywhere
+    assert stray.rounded == 1 and not stray.doubts()  # floaters lie anywhere
 
 
 def test_only_what_dropped_splats_hold_is_told(tmp_path):

@@ -196,14 +196,12 @@ def data_uri(image: Tensor, side: int) -> str:
     return "data:image/png;base64," + base64.b64encode(png(image[top : top + side, left : left + side])).decode("ascii")
 
 
-def write_array(path: str | Path, values: Tensor, *, overwrite: bool = False) -> Path:
-    """Write `values` as 32-bit floats of NumPy's .npy; return the path. Atomic; raises OutputExists, and SceneError for NaN and infinity."""
-    path = Path(path)
+def write_array(path: Path, values: Tensor, *, overwrite: bool) -> None:
+    """Write `values` as 32-bit floats of NumPy's .npy. Atomic; raises OutputExists, and SceneError for NaN and infinity."""
     if not values.isfinite().all():
         raise SceneError(f"{path}: the values hold NaN or infinity and are not written; check the render that they came from")
     with new_file(path, overwrite) as temporary, temporary.open("wb") as file:
         np.save(file, values.detach().to("cpu", torch.float32).numpy())
-    return path
 
 
 def _bytes(image: Tensor) -> np.ndarray:

@@ -132,7 +132,8 @@ def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Ite
     dtype = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
     count = len(next(iter(columns.values())))
     declared = PlyElement.describe(np.broadcast_to(np.zeros((), dtype), (count,)), "vertex")
-    header = PlyData([declared], byte_order="<", comments=[_one_ascii_line(text) for text in comments]).header + "\n"
+    lines = [" ".join(text.splitlines()).encode("ascii", "backslashreplace").decode() for text in comments]
+    header = PlyData([declared], byte_order="<", comments=lines).header + "\n"
     if len(header) >= MAX_HEADER:
         raise SettingsError(f"{path}: comments and provenance take {len(header):,} bytes, but a PLY header holds {MAX_HEADER:,}; shorten them")
     with new_file(path, overwrite) as temporary, temporary.open("xb") as file:
@@ -161,7 +162,10 @@ def _parsed(path: Path, lines: list[bytes], body: int) -> Header:
                 if form not in BYTE_ORDER:
                     raise ValueError(form)
             elif keyword == "element":
-                elements.append(Element(rest.split()[0], _count(rest.split()[1]), ()))
+                name, count = rest.split()[:2]
+                elements.append(Element(name, int(count), ()))
+                if elements[-1].count < 0:
+                    raise ValueError(count)
             elif keyword == "property":
                 elements[-1] = _with_property(elements[-1], rest.split())
             elif keyword in ("comment", "obj_info"):
@@ -188,13 +192,6 @@ def _with_property(element: Element, words: list[str]) -> Element:
     if name in element.names:
         raise _Fault("the second property of this name")
     return replace(element, properties=(*element.properties, (name, " ".join(kind))))
-
-
-def _count(word: str) -> int:
-    count = int(word)
-    if count < 0:
-        raise ValueError(word)
-    return count
 
 
 def _sized(path: Path, header: Header, size: int) -> Header:
@@ -249,7 +246,3 @@ def _read_through_plyfile(path: Path, header: Header, wanted: Element) -> np.nda
         return rows
     except (PlyParseError, ValueError, OverflowError) as error:
         raise CheckpointError(f"{path} is damaged or truncated ({error}); download or export it again") from error
-
-
-def _one_ascii_line(text: str) -> str:
-    return " ".join(text.splitlines()).encode("ascii", "backslashreplace").decode()

@@ -87,20 +87,16 @@ def _too_old(tool: Sequence[str], oldest: Sequence[int]) -> str:
 
 def _version(tool: Sequence[str]) -> tuple[int, ...]:
     """The version of splat-transform, such as (3, 7, 0); empty if it does not say."""
-    try:
-        told = subprocess.run([*tool, "--version"], capture_output=True, text=True, errors="replace", timeout=60, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return ()
-    found = re.search(r"\d+(\.\d+)+", told.stdout + told.stderr)
-    return tuple(map(int, found[0].split("."))) if found and told.returncode == 0 else ()
+    found = re.search(r"\d+(\.\d+)+", answer([*tool, "--version"]) or "")
+    return tuple(map(int, found[0].split("."))) if found else ()
 
 
 def _dotted(version: Sequence[int]) -> str:
     return ".".join(map(str, version))
 
 
-def refuse_as_folder(path: Path) -> None:
-    """Raise SettingsError for a folder whose name has the suffix of an exchange format, or of another file."""
+def refuse_ending(path: Path) -> None:
+    """Raise SettingsError for an output whose name has the suffix of an exchange format, or of another kind of file."""
     names = {ending: name for name, ending in EXCHANGE.values()}
     for ending in (*names, *OF_FILES):
         if path.name.lower().endswith(ending):
@@ -113,13 +109,16 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
 
     Raises CheckpointError.
     """
+    from mipmap_plugin.formats.damage import damage_of  # and NumPy, without which options are read
+    from mipmap_plugin.formats.sog import completed
+
     name, ending = EXCHANGE[kind]
     tool = find_tool()
     if tool is None:
         raise CheckpointError(f"{path} is {name}, an exchange format, which {TOOL} reads, but {TOOL} is not installed; run: {INSTALL}")
     if reason := _too_old(tool, OLDEST_FOR_STREAMED if path.name == LOD_META else ()):
         raise CheckpointError(f"{path} is Streamed SOG: {reason}")
-    if reason := _damage(path):
+    if reason := damage_of(path):
         raise CheckpointError(f"{path} is damaged ({reason}); download or export it again")
     with tempfile.TemporaryDirectory(prefix=TEMPORARY) as folder:
         source = path.absolute()
@@ -127,7 +126,7 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
             source = Path(folder, f"source{ending}")
             shutil.copyfile(path, source)
         plain = Path(folder, "plain.ply")
-        if reason := _run(tool, [_completed(source, Path(folder)) if kind == "sog" else source], plain):
+        if reason := _run(tool, [completed(source, Path(folder)) if kind == "sog" else source], plain):
             raise CheckpointError(f"{path} is {name}, but {TOOL} does not read it ({reason}); export it again")
         try:
             _settle_frame(tool, source, plain)
@@ -137,41 +136,25 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
             raise CheckpointError(str(error).replace(str(plain), f"{path}, as {TOOL} reads it")) from error
 
 
-def _completed(source: Path, folder: Path) -> Path:
-    from mipmap_plugin.formats.sog import completed  # and NumPy, without which options are read
-
-    return completed(source, folder)
-
-
-def _damage(path: Path) -> str:
-    from mipmap_plugin.formats.damage import damage_of  # and NumPy, as above
-
-    return damage_of(path)
-
-
 def write_exchange(path: Path, write: Callable[[Path], Any], *, overwrite: bool) -> Path:
     """Convert the PLY that `write` writes to the exchange format given by the suffix of `path`, atomically; return `path`.
 
     Raises SettingsError (`refuse_exchange`), OutputExists, OutputError.
     """
+    from mipmap_plugin.formats.ply import read_ply  # and NumPy, as above
+    from mipmap_plugin.formats.sog import write_sog
+
     tool = refuse_exchange(path)
     with tempfile.TemporaryDirectory(prefix=TEMPORARY) as folder, new_file(path, overwrite) as temporary:
         ending = next(suffix for suffix in WRITTEN if path.name.lower().endswith(suffix))
         plain, converted = Path(folder, "plain.ply"), Path(folder, f"made{ending}")
         write(plain)
         if ending == ".sog":
-            _write_sog(plain, converted)
+            write_sog(converted, read_ply(plain).columns, antialiased=_mode(plain) == "antialiased")
         else:
             _convert(tool, plain, converted, path)
         shutil.copyfile(converted, temporary)
     return path
-
-
-def _write_sog(plain: Path, converted: Path) -> None:
-    from mipmap_plugin.formats.ply import read_ply  # and NumPy, without which options are read
-    from mipmap_plugin.formats.sog import write_sog
-
-    write_sog(converted, read_ply(plain).columns, antialiased=_mode(plain) == "antialiased")
 
 
 def _convert(tool: Sequence[str], plain: Path, converted: Path, path: Path) -> None:
@@ -200,11 +183,16 @@ def find_tool() -> list[str] | None:
     if npx is None:
         return None
     command = [npx, "--no-install", TOOL]
+    return None if answer([*command, "--version"]) is None else command
+
+
+def answer(command: Sequence[str]) -> str | None:
+    """What a program prints within a minute; None if it cannot be started, or fails."""
     try:
-        version = subprocess.run([*command, "--version"], capture_output=True, timeout=60, check=False)
+        told = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=60, check=False)
     except (OSError, subprocess.TimeoutExpired):
         return None
-    return command if version.returncode == 0 else None
+    return told.stdout + told.stderr if told.returncode == 0 else None
 
 
 def _run(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str:
@@ -225,7 +213,7 @@ def _run(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str
 def _settle_frame(tool: Sequence[str], file: Path, ply: Path) -> None:
     """Turn the splats of a PLY that were, or will be, turned on their way from or to `file`."""
     if is_spz(file) and TURNS_SPZ[0] <= _version(tool) < TURNS_SPZ[1]:
-        from mipmap_plugin.formats.half_turn import half_turned  # and NumPy, without which options are read
+        from mipmap_plugin.formats.spz import half_turned  # and NumPy, without which options are read
 
         half_turned(ply)
 

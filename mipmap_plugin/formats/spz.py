@@ -1,4 +1,4 @@
-"""Positions and spherical harmonics of an SPZ in all the bits that the format has for them, of which its usual writer leaves some unused."""
+"""What splat-transform leaves to be done for an SPZ: all the bits that the format has for positions and spherical harmonics, and its frame."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+
+from mipmap_plugin.formats.ply import read_ply, write_ply
 
 # The header: magic, version, splats, SH degree, bits of fractions, flags, and a byte that is reserved.
 HEADER = struct.Struct("<4sIIBBBB")
@@ -43,6 +45,24 @@ def refine(file: Path, columns: Mapping[str, np.ndarray]) -> None:
 def fraction_for(farthest: float) -> int:
     """How many bits of fractions fit for coordinates up to `farthest`; below 0 where none does."""
     return min(MOST_FRACTION, math.floor(math.log2(LARGEST_POSITION / max(farthest, 2.0**-MOST_FRACTION))))
+
+
+def half_turned(path: Path) -> None:
+    """Turn the splats of a 3DGS PLY by half a turn about x, which is exact: only signs change, those of y and z among them."""
+    ply = read_ply(path)
+    rest = sum(name.startswith("f_rest_") for name in ply.columns)
+    negated = {"y", "z", "ny", "nz", "rot_2", "rot_3"}  # the quaternion also turns about the splat's own x, which does not change its shape
+    negated |= {f"f_rest_{i}" for i in range(rest) if _is_odd(i % (rest // 3) + 1)}
+    columns = {name: -column if name in negated else column for name, column in ply.columns.items()}
+    write_ply(path, columns, ply.comments, overwrite=True)
+
+
+def _is_odd(coefficient: int) -> bool:
+    """Whether a spherical harmonic, numbered from 0 for degree 0, changes its sign with y and z: those of negative orders change it with y, and those
+    whose degree and order differ by an odd number with z."""
+    degree = math.isqrt(coefficient)
+    order = coefficient - degree * (degree + 1)
+    return (order < 0) != ((degree - order) % 2 == 1)
 
 
 def _positions(means: np.ndarray) -> tuple[int, bytes]:

@@ -1,4 +1,4 @@
-"""Reading the weights of a network from a torch file as data; nothing in the file is executed."""
+"""The weights of a network, read from a torch file as data: nothing in the file is executed."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
+from torch.nn.functional import linear
 
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.torch_file import load_torch
@@ -33,3 +34,13 @@ def require(state: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]], 
         shape = tuple(state[name].shape)
         if len(shape) != len(wanted) or any(want not in (-1, size) for size, want in zip(shape, wanted, strict=True)):
             raise CheckpointError(f"{where}: {name} has the shape {list(shape)}, not {list(wanted)}")
+
+
+def shapes_of(layers: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
+    """The shapes of the weights and biases of linear layers, by their names in a state dict. `layers`: (outputs, inputs) of each."""
+    return {f"{name}.weight": shape for name, shape in layers.items()} | {f"{name}.bias": shape[:1] for name, shape in layers.items()}
+
+
+def run_layer(state: Mapping[str, Tensor], name: str, inputs: Tensor) -> Tensor:
+    """The outputs [N, B] of the linear layer `name` for `inputs` [N, A]."""
+    return linear(inputs, state[f"{name}.weight"], state[f"{name}.bias"])

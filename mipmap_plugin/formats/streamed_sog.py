@@ -17,7 +17,7 @@ from typing import Any
 
 from mipmap_plugin.errors import OutputError
 from mipmap_plugin.formats.json_file import read_json
-from mipmap_plugin.formats.splat_transform import TOOL, reason_in, refuse_exchange
+from mipmap_plugin.formats.splat_transform import TOOL, answer, reason_in, refuse_exchange
 from mipmap_plugin.progress import told
 
 # Thousands of splats in a file where there is no GPU: about 1 ms for each splat, at 4 as at 8; twice that at 16.
@@ -62,10 +62,7 @@ def write_streamed_sog(levels: Sequence[Path], output: Path, extent: int) -> Non
 
 def _graphics_card(tool: Sequence[str]) -> str:
     """The number of the first GPU that splat-transform lists; empty if there is none."""
-    try:
-        listed = subprocess.run([*tool, "--list-gpus"], capture_output=True, text=True, errors="replace", timeout=60, check=False).stdout
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
+    listed = answer([*tool, "--list-gpus"]) or ""
     return next((number for number, name in re.findall(r"^\[(\d+)\] (.*)$", listed, re.MULTILINE) if not SOFTWARE.search(name)), "")
 
 

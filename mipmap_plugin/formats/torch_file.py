@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +48,7 @@ def load_torch(path: Path) -> Any:
     read_head(path, 512)
     try:
         refuse_hostile(path)
-        with _allowing_scalars():
+        with torch.serialization.safe_globals(_SAFE):
             content = torch.load(path, map_location="cpu", weights_only=True)
         storages: dict[int, int] = {}
         for tensor in _tensors(content):
@@ -66,11 +65,6 @@ def _reason(error: Exception) -> str:
     """The first line of the error, without torch's advice before and after it."""
     text = str(error).rpartition("WeightsUnpickler error:")[2].strip()
     return (text.splitlines() or [type(error).__name__])[0].partition(". Please use")[0][:160]
-
-
-def _allowing_scalars() -> AbstractContextManager[None]:
-    """A context in which NumPy's scalars may be unpickled. Older versions of torch cannot allow them, and refuse such files by name."""
-    return torch.serialization.safe_globals(_SAFE) if hasattr(torch.serialization, "safe_globals") else nullcontext()
 
 
 def _tensors(content: Any) -> Iterator[Tensor]:

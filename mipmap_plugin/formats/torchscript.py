@@ -48,7 +48,8 @@ def read_torchscript(path: str | Path) -> dict[str, Tensor]:
         with zipfile.ZipFile(path) as archive:
             refuse_packed(archive, path)
             root = next(name for name in archive.namelist() if name.endswith("/data.pkl")).removesuffix("/data.pkl")
-            if _member(archive, f"{root}/byteorder", 16, missing=b"little") != b"little":
+            order = f"{root}/byteorder"
+            if order in archive.namelist() and _member(archive, order, 16) != b"little":
                 raise ValueError("its numbers are big-endian")
             program = _member(archive, f"{root}/data.pkl", MAX_PICKLE)
             scan(io.BytesIO(program), None)
@@ -118,10 +119,8 @@ class _Weights(pickle.Unpickler):
         return torch.frombuffer(bytearray(content), dtype=storage.dtype).as_strided(shape, strides, offset).clone()
 
 
-def _member(archive: zipfile.ZipFile, name: str, most: int, missing: bytes | None = None) -> bytes:
-    """The bytes of a member, at most `most`; `missing`, if given, for a member that does not exist."""
-    if missing is not None and name not in archive.namelist():
-        return missing
+def _member(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
+    """The bytes of a member, at most `most`."""
     with archive.open(name) as file:
         content = file.read(most + 1)
     if len(content) > most:

@@ -20,20 +20,8 @@ if TYPE_CHECKING:
     from mipmap_plugin.models.base import SplatModel, TrainedScale, Traits
 
 __all__ = [
-    "API_VERSION",
-    "BY_COMPANIONS",
-    "CERTAIN",
-    "PLAIN",
-    "Checkpoint",
-    "Family",
-    "Files",
-    "Match",
-    "SplatModel",
-    "TrainedScale",
-    "Traits",
-    "detect",
-    "load_model",
-    "register_model",
+    "API_VERSION", "BY_COMPANIONS", "CERTAIN", "PLAIN", "Checkpoint", "Family", "Files", "Match", "SplatModel", "TrainedScale", "Traits", "detect",
+    "load_model", "register_model",
 ]  # fmt: skip
 
 # Of a float32, which all backends draw.

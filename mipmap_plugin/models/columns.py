@@ -32,6 +32,7 @@ DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 QUATERNION = ("rot_0", "rot_1", "rot_2", "rot_3")
 RGB, ALPHA = ("red", "green", "blue"), "alpha"
+NEEDED = (*POSITION, *DC, "opacity", *SCALE, *QUATERNION)  # without which a file is none of 3DGS
 FILTER_3D = "filter_3D"  # of Mip-Splatting and its successors (`models.mip`)
 
 
@@ -42,8 +43,7 @@ def to_parameters(columns: Mapping[str, np.ndarray], path: Path) -> dict[str, Te
     Raises CheckpointError for missing columns and for a number of f_rest columns that fits no SH degree.
     """
     columns = _with_logits(_with_dc(_with_halves(columns)))
-    missing = [name for name in (*POSITION, *DC, "opacity", *SCALE, *QUATERNION) if name not in columns]
-    if missing:
+    if missing := [name for name in NEEDED if name not in columns]:
         raise CheckpointError(f"{path} is no 3DGS checkpoint: it lacks the columns {', '.join(missing)}; export it again with them")
     rest = rest_names(columns)
     if len(rest) not in SH_DEGREES:
@@ -89,7 +89,7 @@ def extra_names(columns: Mapping[str, np.ndarray]) -> list[str]:
 
     Not a second set of colors: they would no longer be those of the splats, and some viewers prefer them (`second_colors`).
     """
-    known = {*POSITION, *DC, "opacity", *SCALE, *QUATERNION, *rest_names(columns)}
+    known = {*NEEDED, *rest_names(columns)}
     known |= set() if any(columns[name].any() for name in NORMAL if name in columns) else set(NORMAL)
     known |= {*RGB, ALPHA} if all(name in columns for name in RGB) else set()
     return [name for name in columns if name not in known]
@@ -103,6 +103,15 @@ def notes_on(extras: Mapping[str, np.ndarray]) -> list[str]:
         kernel = "whose particles are Gaussians only of degree 2, which is not its default"
         notes.append(f"its normals are those that 3DGRUT and MetalSplatter write: if it was trained with 3DGRT, {kernel}, it is drawn otherwise here")
     return notes
+
+
+def notes_on_types(columns: Mapping[str, np.ndarray]) -> list[str]:
+    """What is said of columns in other types, or of another meaning, than 3DGS gives them, in sentences."""
+    whole = _whole_opacities(columns)
+    notes = [f"its opacities are whole numbers ({whole}), read as fractions of the largest"] if whole else []
+    notes += ["its columns have 16 bits, read as half-precision floats"] if _holds_halves(columns) else []
+    notes += [f"its colors are floats above {BRIGHTEST}, read as numbers in 0..255"] if has_bright_colors(columns) else []
+    return notes + second_colors(columns)
 
 
 def second_colors(columns: Iterable[str]) -> list[str]:
@@ -123,16 +132,16 @@ def numbered(columns: Iterable[str], prefix: str) -> tuple[str, ...]:
     return tuple(sorted(names, key=lambda name: int(name.removeprefix(prefix))))
 
 
-def holds_halves(columns: Mapping[str, np.ndarray]) -> bool:
+def _holds_halves(columns: Mapping[str, np.ndarray]) -> bool:
     """Whether these are half-precision floats, which PLY has no name for, so that exporters write ushort: log scales are no whole numbers."""
     sizes = [columns[name].dtype for name in (*SCALE, *QUATERNION) if name in columns]
     return bool(sizes) and all(dtype.kind == "u" and dtype.itemsize == 2 for dtype in sizes)
 
 
 def _with_halves(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
-    if not holds_halves(columns):
+    if not _holds_halves(columns):
         return columns
-    known = {*POSITION, *DC, "opacity", *SCALE, *QUATERNION, *rest_names(columns)}
+    known = {*NEEDED, *rest_names(columns)}
     halves = {name for name, column in columns.items() if name in known and column.dtype.str[1:] == "u2"}
     return {name: column.view(f"{column.dtype.str[0]}f2") if name in halves else column for name, column in columns.items()}
 
@@ -154,15 +163,15 @@ def has_bright_colors(columns: Mapping[str, np.ndarray]) -> bool:
 
 def _with_logits(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
     """The columns with logits of opacities that are whole numbers of full range, as of point clouds: logits are none."""
-    if not whole_opacities(columns):
+    if not _whole_opacities(columns):
         return columns
     opacities = _unit(columns["opacity"]).clip(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
     return {**columns, "opacity": np.log(opacities / (1 - opacities))}
 
 
-def whole_opacities(columns: Mapping[str, np.ndarray]) -> str:
+def _whole_opacities(columns: Mapping[str, np.ndarray]) -> str:
     """The type of opacities that are whole numbers; "" if they are floats, or missing."""
-    whole = "opacity" in columns and columns["opacity"].dtype.kind in "iu" and not holds_halves(columns)
+    whole = "opacity" in columns and columns["opacity"].dtype.kind in "iu" and not _holds_halves(columns)
     return columns["opacity"].dtype.name if whole else ""
 
 

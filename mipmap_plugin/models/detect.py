@@ -166,7 +166,8 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
     if iteration is not None:
         raise CheckpointError(f"{folder} has no point_cloud/iteration_{iteration}; give the model folder above it, or no iteration")
     files = sorted(folder.iterdir())
-    clouds = [file for file in files if file.suffix.lower() == ".ply"] or [file for file in files if _is_exchanged(file)]
+    clouds = [file for file in files if file.suffix.lower() == ".ply"]
+    clouds = clouds or [file for file in files if file.suffix.lower() in EXCHANGED and file.is_file()]
     clouds = [cloud for cloud in clouds if not cloud.with_name(cloud.name + REPORT).exists()] or clouds  # no adaptations, where there is a base
     if len(clouds) > 1 and folder / "point_cloud.ply" in clouds:
         clouds = [folder / "point_cloud.ply"]
@@ -180,10 +181,6 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
         raise CheckpointError(f"{folder} lies above its checkpoint{'s' * (len(below) > 1)}; give {' or '.join(map(str, below[:NAMED]))}{more}")
     content = f"{len(clouds)} files of splats ({some})" if clouds else f"no point_cloud folder and no file of splats{_instead(folder)}"
     raise CheckpointError(f"{folder} holds {content}; give one file, or a model folder with point_cloud/iteration_<N>")
-
-
-def _is_exchanged(file: Path) -> bool:
-    return file.suffix.lower() in EXCHANGED and file.is_file()
 
 
 def _instead(folder: Path) -> str:
@@ -222,7 +219,7 @@ def _was_adapted(folder: Path) -> bool:
 
 def _is_whole(folder: Path) -> bool:
     """Whether a folder is a model folder."""
-    return (folder / "point_cloud").is_dir() or any(_has_place(folder, name) for name in FAMILIES.names())
+    return (folder / "point_cloud").is_dir() or any(True for _ in _placed(folder, below=True))
 
 
 def _folders_in(folder: Path) -> list[Path]:
@@ -231,15 +228,6 @@ def _folders_in(folder: Path) -> list[Path]:
         return sorted(each for each in folder.iterdir() if each.is_dir() and not each.is_symlink())
     except OSError:
         return []
-
-
-def _has_place(folder: Path, name: str) -> bool:
-    """Whether the family `name` has checkpoints in a result folder, in a place of its own."""
-    try:
-        family = find_family(name)
-        return bool(family.place and family.place[0] and _steps(folder, family))
-    except Exception:  # third-party code may fail in any way
-        return False
 
 
 def _detect_iteration(folder: Path, wanted: int | None) -> Checkpoint:
@@ -265,12 +253,12 @@ def _detect_iteration(folder: Path, wanted: int | None) -> Checkpoint:
     raise CheckpointError(f"{folder} has no whole checkpoint: {'; '.join(troubles)}")
 
 
-def _placed(folder: Path) -> Iterator[tuple[Family, dict[int, Path]]]:
-    """The families that have checkpoints in a result folder. Families that fail are skipped here; `_claims` reports them."""
+def _placed(folder: Path, *, below: bool = False) -> Iterator[tuple[Family, dict[int, Path]]]:
+    """The families that have checkpoints in a result folder; `below`: in a subfolder. Families that fail are skipped here; `_claims` reports them."""
     for name in FAMILIES.names():
         try:
             family = find_family(name)
-            if steps := _steps(folder, family):
+            if family.place and (family.place[0] or not below) and (steps := _steps(folder, family, *family.place)):
                 yield family, steps
         except CheckpointError:
             raise
@@ -278,11 +266,8 @@ def _placed(folder: Path) -> Iterator[tuple[Family, dict[int, Path]]]:
             continue
 
 
-def _steps(folder: Path, family: Family) -> dict[int, Path]:
-    """The checkpoints of a family in a result folder by step, 0 for a name without one; of several ranks the first."""
-    if family.place is None:
-        return {}
-    below, pattern = family.place
+def _steps(folder: Path, family: Family, below: str, pattern: str) -> dict[int, Path]:
+    """The checkpoints of a family in its place in a result folder by step, 0 for a name without one; of several ranks the first."""
     place = folder / below
     files = sorted(place.iterdir(), reverse=True) if place.is_dir() else []
     named = {int(name.groupdict().get("step") or 0): file for file in files if (name := re.fullmatch(pattern, file.name))}

@@ -27,19 +27,9 @@ FILTERED = ("mip", "gof", "analytic")
 FLAT_OR_FILTERED = (*FILTERED, "2dgs")
 
 
-def plain(files: Files) -> Match | None:
-    """Recognize a PLY with the columns of 3DGS."""
-    return Match(PLAIN, "columns of splats") if files.holds_splats else None
-
-
-def certain(test: Callable[[Files], bool], why: str, trouble: str = "") -> Recognize:
-    """Recognize files that pass `test`, which those of no other family do. `trouble` is formatted with the path."""
-    return lambda files: Match(CERTAIN, why, trouble.format(path=files.path)) if test(files) else None
-
-
-def has(*columns: str) -> Recognize:
-    """Recognize a PLY with these columns, which no other family has."""
-    return certain(lambda files: files.columns >= set(columns), f"columns {', '.join(columns)}")
+def where(test: Callable[[Files], object], why: str, trouble: str = "", *, sure: float = CERTAIN) -> Recognize:
+    """Recognize files that pass `test`. `trouble` is formatted with the path."""
+    return lambda files: Match(sure, why, trouble.format(path=files.path)) if test(files) else None
 
 
 def anchors(name: str) -> Recognize:
@@ -119,57 +109,41 @@ def _lost_network(files: Files, family: str) -> Match | None:
     return Match(BY_COMPANIONS, "networks of other iterations", trouble)
 
 
-def exchange(files: Files) -> Match | None:
-    """Recognize the exchange formats of viewers."""
-    return Match(CERTAIN, "its first bytes") if files.kind in EXCHANGE or files.compressed else None
-
-
-def zipped(files: Files) -> Match | None:
-    """Recognize a zip archive of one PLY."""
-    return Match(CERTAIN, "a zip archive of one PLY") if files.kind == "zip" and only_ply(files.path) else None
-
-
-def torch_file(*words: str, sure: float = CERTAIN, trouble: str = "") -> Recognize:
-    """Recognize a torch file that contains one of these words."""
-    return lambda files: Match(sure, f"holds {words[0]}", trouble.format(path=files.path)) if files.words(*words) else None
-
-
-def gsplat(files: Files) -> Match | None:
-    """Recognize gsplat's checkpoints: torch files whose splats are a dictionary of that name."""
-    return Match(CERTAIN, "holds splats") if files.strings("splats") else None
-
-
-def fudan(files: Files) -> Match | None:
-    """Recognize 4D Gaussian Splatting of fudan-zvg."""
-    trouble = f"{files.path} is of 4D Gaussian Splatting (fudan-zvg), whose splats have a time of their own, which is not read here"
-    return Match(BY_COMPANIONS, "its optimizer's names", trouble) if files.words(*FUDAN) == set(FUDAN) else None
-
-
 family = partial(Family, api_version=API_VERSION)
 LOADERS = "mipmap_plugin.models"
 
 BUILT_IN = (
-    family("3dgs", "3D Gaussian splatting", plain, load=f"{LOADERS}.reading:load_vanilla"),
+    family(
+        "3dgs", "3D Gaussian splatting", where(lambda files: files.holds_splats, "columns of splats", sure=PLAIN),
+        load=f"{LOADERS}.reading:load_vanilla",
+    ),
     *(
         family(name, title, filtered(name), load=f"{LOADERS}.mip:load_mip", before=("2dgs",))
         for name, title in {"mip": "Mip-Splatting", "gof": "Gaussian Opacity Fields", "analytic": "Analytic-Splatting"}.items()
     ),
-    family("2dgs", "2D Gaussian splatting", certain(_is_flat, "two scales"), load=f"{LOADERS}.surfels:load_surfels"),
+    family("2dgs", "2D Gaussian splatting", where(_is_flat, "two scales"), load=f"{LOADERS}.surfels:load_surfels"),
     family("scaffold", "Scaffold-GS", anchors("scaffold"), load=f"{LOADERS}.anchors.scaffold:load_scaffold", before=FLAT_OR_FILTERED),
     family("octree", "Octree-GS", anchors("octree"), load=f"{LOADERS}.anchors.octree:load_octree", before=FLAT_OR_FILTERED),
     family("deformable", "Deformable 3D Gaussians", deformable, load=f"{LOADERS}.moving.deformable:load_deformable"),
     family("4dgs", "4D Gaussians", hexplane, load=f"{LOADERS}.moving.hexplane:load_hexplane", before=("deformable", "sc-gs")),
-    family("gsplat", "gsplat", gsplat, load=f"{LOADERS}.gsplat.model:load_gsplat", before=("splatfacto",), place=GSPLAT),
     family(
-        "splatfacto", "splatfacto (nerfstudio)", torch_file("pipeline", "gauss_params"),
+        "gsplat", "gsplat", where(lambda files: files.strings("splats"), "holds splats"),  # as a key
+        load=f"{LOADERS}.gsplat.model:load_gsplat", before=("splatfacto",), place=GSPLAT,
+    ),
+    family(
+        "splatfacto", "splatfacto (nerfstudio)", where(lambda files: files.words("pipeline", "gauss_params"), "holds pipeline"),
         load=f"{LOADERS}.splatfacto:load_splatfacto", place=SPLATFACTO,
     ),
     family(
-        "exchange", "exchange format (SPZ, SOG, KSPLAT, SPLAT, compressed PLY)", exchange,
+        "exchange", "exchange format (SPZ, SOG, KSPLAT, SPLAT, compressed PLY)",
+        where(lambda files: files.kind in EXCHANGE or files.compressed, "its first bytes"),
         load=f"{LOADERS}.exchanged:load_exchanged", place=("", r"(lod-)?meta\.json"),
     ),
-    family("gltf", "glTF (KHR_gaussian_splatting)", certain(lambda files: files.kind == "glb", "its first bytes"), load=f"{LOADERS}.gltf:load_gltf"),
-    family("zipped", "PLY in a zip archive", zipped, load=f"{LOADERS}.zipped:load_zipped"),
+    family("gltf", "glTF (KHR_gaussian_splatting)", where(lambda files: files.kind == "glb", "its first bytes"), load=f"{LOADERS}.gltf:load_gltf"),
+    family(
+        "zipped", "PLY in a zip archive", where(lambda files: files.kind == "zip" and only_ply(files.path), "a zip archive of one PLY"),
+        load=f"{LOADERS}.exchanged:load_zipped",
+    ),
     # Recognized in order to be refused with a clear message.
     family(
         "anygs", "Octree-AnyGS", anchors("anygs"), before=FLAT_OR_FILTERED,
@@ -180,59 +154,67 @@ BUILT_IN = (
         "hac", "HAC", anchors("hac"), before=FLAT_OR_FILTERED,
         not_loaded=": its networks and grids lie in checkpoint.pth (HAC++, ContextGS and others store theirs so too)",
     ),
-    family("spacetime", "SpacetimeGaussians", has("trbf_center"), before=("sc-gs", *FLAT_OR_FILTERED)),
+    family(
+        "spacetime", "SpacetimeGaussians", where(lambda files: "trbf_center" in files.columns, "columns trbf_center"),
+        before=("sc-gs", *FLAT_OR_FILTERED),
+    ),
     family("sc-gs", "SC-GS", controlled, before=FLAT_OR_FILTERED),
     family(
-        "many-scales", "another model", certain(
+        "many-scales", "another model", where(
             lambda files: "scale_3" in files.columns and not ANCHOR_COLUMNS & files.columns, "column scale_3",
             "{path} has the column scale_3, which no splats have: it holds anchors or another model; give what it exports",
         ),
         before=("spacetime", "sc-gs", *FLAT_OR_FILTERED),
     ),
     family(
-        "3d-hgs", "3D-HGS", certain(
+        "3d-hgs", "3D-HGS", where(
             lambda files: {"opacity1", "opacity2"} <= files.columns, "columns opacity1, opacity2",
             "{path} holds half-Gaussians (3D-HGS), whose two halves have opacities of their own, which are not read here",
         ),
         before=("many-scales", "spacetime", "sc-gs", *FLAT_OR_FILTERED),
     ),
     family(
-        "saga", "SAGA", certain(
+        "saga", "SAGA", where(
             lambda files: {"f_0", "opacity"} <= files.columns and "f_dc_0" not in files.columns, "features without colors",
             "{path} holds features without colors (SAGA); give the scene_point_cloud.ply of its training",
         ),
         before=("spacetime", "sc-gs", *FLAT_OR_FILTERED),
     ),
     family(
-        "gsplat-png", "gsplat's PngCompression", certain(
+        "gsplat-png", "gsplat's PngCompression", where(
             lambda files: files.kind == "gsplat-png", "a meta.json of pictures",
             "{path} lists the pictures of gsplat's PngCompression, which are quantized; give the ckpts/ckpt_*.pt that they were made from",
         ),
         place=("", r"meta\.json"),
     ),
     family(
-        "beta", "Deformable Beta Splatting", certain(
+        "beta", "Deformable Beta Splatting", where(
             lambda files: {"beta", "sh0_0"} <= files.columns, "columns beta, sh0_0",
             "{path} is of Deformable Beta Splatting, whose kernels are no Gaussians, which is not read here",
         ),
     ),
     family(
-        "3dgrut", "3DGRUT", certain(
+        "3dgrut", "3DGRUT", where(
             lambda files: files.words(*GRUT) == set(GRUT), "its parameters' names",
             "{path} is of 3DGRUT, whose checkpoints are not read here; give the PLY that it exports (export_ply.enabled=true)",
         ),
     ),
-    family("fudan", "4D Gaussian Splatting (fudan-zvg)", fudan),
     family(
-        "training", "a training run", torch_file(
-            "param_groups", sure=0.3,
-            trouble="{path} is the state of a training run; give the point_cloud.ply or the model folder that was saved beside it",
+        "fudan", "4D Gaussian Splatting (fudan-zvg)", where(
+            lambda files: files.words(*FUDAN) == set(FUDAN), "its optimizer's names",
+            "{path} is of 4D Gaussian Splatting (fudan-zvg), whose splats have a time of their own, which is not read here", sure=BY_COMPANIONS,
         ),
     ),
     family(
-        "network", "a deformation network", torch_file(
-            "linear.0.weight", "nodes", "deformation_net", sure=0.2,
-            trouble="{path} is a deformation network without its splats; give the model folder that holds both",
+        "training", "a training run", where(
+            lambda files: files.words("param_groups"), "holds param_groups",
+            "{path} is the state of a training run; give the point_cloud.ply or the model folder that was saved beside it", sure=0.3,
+        ),
+    ),
+    family(
+        "network", "a deformation network", where(
+            lambda files: files.words("linear.0.weight", "nodes", "deformation_net"), "holds linear.0.weight",
+            "{path} is a deformation network without its splats; give the model folder that holds both", sure=0.2,
         ),
     ),
 )  # fmt: skip

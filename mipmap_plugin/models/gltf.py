@@ -16,9 +16,9 @@ from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.splat_transform import as_ply
 from mipmap_plugin.models.columns import to_parameters
 from mipmap_plugin.models.detect import detect_as
-from mipmap_plugin.models.health import without_invalid
 from mipmap_plugin.models.inria_folder import trained_scale
 from mipmap_plugin.models.raw import check, log, logit
+from mipmap_plugin.models.reading import without_invalid
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.splatting.harmonics import C0, rotated
 from mipmap_plugin.splatting.rotations import quaternion_product, quaternions, unit_quaternions

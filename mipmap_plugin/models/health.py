@@ -1,37 +1,18 @@
-"""Counts of unusual or invalid splats in a checkpoint; nothing is changed, except by `drop`."""
+"""Counts of unusual or invalid splats in a checkpoint; nothing is changed."""
 
 from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.models.base import OF_3DGS, SplatModel
-
-Model = TypeVar("Model", bound="IsRead")
-
-
-def units(length: float, digits: int) -> str:
-    """A length as people write it: so many digits, but large lengths whole, and without a power of ten."""
-    return f"{length:.{digits}g}" if length < 10**digits - 0.5 else f"{length:,.0f}"
-
-
-class IsRead(SplatModel, Protocol):
-    """A model of splats that is checked when it is read."""
-
-    def keep_rows(self: Model, keep: Tensor) -> Model:
-        """A new model of the rows where `keep` [N] is True."""
-
-    def noted(self: Model, note: str) -> Model:
-        """The same model with one more note."""
-
 
 # Below one 8-bit step no 3DGS rasterizer draws a splat (diff-gaussian-rasterization, forward.cu).
 MIN_VISIBLE = 1 / 255
@@ -105,8 +86,8 @@ class Health:
             (self.invisible, "have an opacity below 1/255 and are never drawn"),
             (self.splats * self.faint, "have an opacity below 2 %, as right after training resets them; give a later checkpoint if it is faint"),
         ]
-        remarks = [*self.non_finite(), *(f"{count:,} of {self.splats:,} splats {what}" for count, what in counts if count)]
-        return remarks + self.doubts()
+        remarks = [f"{count:,} of {self.splats:,} splats {what}" for count, what in counts if count]
+        return [*_non_finite(self.splats, self.nan, self.infinite), *remarks, *self.doubts()]
 
     def spoilt(self) -> bool:
         """Whether some splats spoil images, none is drawn, places are lost, or stored values look like those of another convention."""
@@ -120,30 +101,26 @@ class Health:
 
     def doubts(self) -> list[str]:
         """That places are lost, or that stored values look like those of another convention, in sentences."""
-        return doubts(self.coarse(), self.scales_look_linear, self.opacities_look_activated)
-
-    def coarse(self) -> str:
-        """That many splats lie too far from the origin for float32, in a sentence; "" if few do."""
-        return coarse(self.rounded, self.splats, self.step)
-
-    def non_finite(self) -> list[str]:
-        """The sentences on NaN and infinity."""
-        counts = [("a NaN", name, n) for name, n in self.nan.items()] + [("an infinity", name, n) for name, n in self.infinite.items()]
-        return [f"{count:,} of {self.splats:,} splats hold {kind} in {name}" for kind, name, count in counts if count]
+        return doubts(self.splats, self.rounded, self.step, self.scales_look_linear, self.opacities_look_activated)
 
 
-def doubts(lost: str, linear: bool, activated: bool) -> list[str]:
-    """`Health.doubts`, of `coarse` and its two flags."""
-    return [sentence for sentence, doubtful in ((lost, bool(lost)), (LINEAR, linear), (ACTIVATED, activated)) if doubtful]
-
-
-def coarse(rounded: int, splats: int, step: float) -> str:
-    """`Health.coarse`, of its three numbers."""
-    if rounded <= COARSE_SHARE * splats:
-        return ""
-    count, remedy = f"{rounded:,} of {splats:,} splats", "export the scene again, moved near the origin together with its cameras"
+def doubts(splats: int, rounded: int, step: float, linear: bool, activated: bool) -> list[str]:
+    """`Health.doubts`, of what it counts."""
     why = f"lie {ROUNDED} to steps of {step:.2g} units, which is much for their size"
-    return f"{count} {why}; {remedy}"
+    lost = f"{rounded:,} of {splats:,} splats {why}; export the scene again, moved near the origin together with its cameras"
+    found = {lost: rounded > COARSE_SHARE * splats, LINEAR: linear, ACTIVATED: activated}
+    return [sentence for sentence, doubtful in found.items() if doubtful]
+
+
+def _non_finite(splats: int, nan: Mapping[str, int], infinite: Mapping[str, int]) -> list[str]:
+    """The sentences on NaN and infinity: so many of the `splats`, by parameter."""
+    found = {"a NaN": nan, "an infinity": infinite}
+    return [f"{count:,} of {splats:,} splats hold {kind} in {name}" for kind, by_name in found.items() for name, count in by_name.items() if count]
+
+
+def units(length: float, digits: int) -> str:
+    """A length as people write it: so many digits, but large lengths whole, and without a power of ten."""
+    return f"{length:.{digits}g}" if length < 10**digits - 0.5 else f"{length:,.0f}"
 
 
 def holds_splats(model: SplatModel) -> bool:
@@ -188,37 +165,8 @@ def why_invalid(model: SplatModel, invalid: Tensor) -> list[str]:
     # An opacity of 0 or 1 and a length of 0 are stored as infinities.
     infinite = {name: _each_row(tensor == math.inf if name == "scales" else tensor.isinf()) for name, tensor in rows.items() if name != "opacities"}
     told = torch.stack([*nan.values(), *infinite.values()]).any(0)
-    count, sentences = len(invalid), []
-    for kind, found in (("a NaN", nan), ("an infinity", infinite)):
-        sentences += [f"{n:,} of {count:,} splats hold {kind} in {name}" for name, each in found.items() if (n := _rows(each))]
-    return sentences + ([f"{n:,} of {count:,} splats are above {LARGEST:g} once activated"] if (n := _rows(~told)) else [])
-
-
-def drop(model: Model, mask: Tensor, why: str, source: Path | str | None) -> Model:
-    """A new model without the rows where `mask` [N] is True, with a note and a warning of their number. `source`: where they come from."""
-    kept = model.keep_rows(~mask)
-    kept.notes.append(dropped(mask, "splats", why, source))
-    return kept
-
-
-def without_invalid(model: Model) -> Model:
-    """The model without splats that are not finite once activated, with a note. Raises CheckpointError if none or few are left (`refuse_few`),
-    and for a file without any.
-
-    Once for each model it warns of what is doubtful (`Health.doubts`), such as positions that float32 does not hold: a file of doubles loses them
-    only here.
-    """
-    health = examine(model)
-    if model.source is not None and not health.splats:
-        raise CheckpointError(f"{model.source} holds no splats; export it again")
-    refuse_few(health.invalid, model.source)
-    for doubt in health.doubts():
-        if doubt not in model.notes:
-            warnings.warn(f"{model.source or 'this model'}: {doubt}", stacklevel=2)
-            model = model.noted(doubt)
-    if not health.invalid.any():
-        return model
-    return drop(model, health.invalid, "; ".join(why_invalid(model, health.invalid)), model.source)
+    sentences = _non_finite(len(invalid), *({name: _rows(each) for name, each in found.items()} for found in (nan, infinite)))
+    return sentences + ([f"{n:,} of {len(invalid):,} splats are above {LARGEST:g} once activated"] if (n := _rows(~told)) else [])
 
 
 def refuse_few(invalid: Tensor, source: Path | str | None) -> None:

@@ -100,14 +100,17 @@ def write_folder(target: Path, source: Path | None, cfg_args: str, iteration: in
 def cfg_args_for(source: Path | None, target: Path, trained: TrainedScale, sh_degree: int) -> str:
     """The text of the new cfg_args: the source's own if SH degree and screen filter agree, else its options, or the defaults of 3DGS.
 
-    Options that determine another screen filter are left out, because readers of the folder would use it. Whether views were held out (`eval`) is
-    None where it is not known: no --eval to 3DGS, which asks for the option.
+    Options that determine another screen filter are left out, because readers of the folder would use it.
     """
     options, _ = read_options(source)
     fits = not any(name in options for name in FILTER_OPTIONS) or _screen_filter(options, None) == (trained.screen_filter, trained.eps2d)
     options = {name: value for name, value in options.items() if fits or name not in FILTER_OPTIONS}
     if fits and source is not None and options.get("sh_degree") == sh_degree:
         return cfg_args_text(source / "cfg_args")
-    usual = {"source_path": "", "model_path": str(target), "images": "images", "resolution": trained.resolution, "data_device": "cuda", "eval": None}
     white = trained.background == (1.0, 1.0, 1.0)
-    return format_cfg_args({**usual, "white_background": white, **options, "sh_degree": sh_degree})
+    return format_cfg_args({**usual_options(target, trained), "white_background": white, **options, "sh_degree": sh_degree})
+
+
+def usual_options(target: Path, trained: TrainedScale) -> dict[str, Any]:
+    """The options of a model folder at `target` that has none. Whether views were held out (`eval`) is None, not known: no --eval to 3DGS."""
+    return {"source_path": "", "model_path": str(target), "images": "images", "resolution": trained.resolution, "data_device": "cuda", "eval": None}

@@ -19,7 +19,8 @@ from mipmap_plugin.models.anchors.scaffold import scaffold_in_memory
 from mipmap_plugin.models.base import CARRIED, OPACITY_ROUNDING, SplatModel, TrainedScale, tensors_of
 from mipmap_plugin.models.contract import lacking
 from mipmap_plugin.models.gsplat import model as gsplat
-from mipmap_plugin.models.health import holds_splats, rows_where, without_invalid
+from mipmap_plugin.models.health import holds_splats, rows_where
+from mipmap_plugin.models.reading import without_invalid
 from mipmap_plugin.models.surfels import FLAT, SurfelModel, flat_trained
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 

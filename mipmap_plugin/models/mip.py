@@ -24,9 +24,9 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import CARRIED, SplatModel, TrainedScale, Traits
 from mipmap_plugin.models.columns import FILTER_3D as COLUMN
 from mipmap_plugin.models.detect import detect_as
-from mipmap_plugin.models.health import LARGEST, drop
+from mipmap_plugin.models.health import LARGEST
 from mipmap_plugin.models.outputs import finite
-from mipmap_plugin.models.reading import read_splats
+from mipmap_plugin.models.reading import drop, read_splats
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting.viewers import degree_for, find_viewer, reads_extra_columns, viewers_for
 

@@ -15,7 +15,7 @@ from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.formats.atomic import absolute, named, refuse_output, refuse_to_lose
 from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.formats.ply import read_header
-from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_glb, is_spz, is_written, refuse_as_folder, refuse_exchange
+from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_glb, is_spz, is_written, refuse_ending, refuse_exchange
 from mipmap_plugin.formats.spz import fraction_for
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
@@ -57,7 +57,7 @@ def refuse_parts(path: Path, overwrite: bool, source: Path | None, folder: Path 
     """
     refuse_output(path, overwrite, parts_of(source, folder), is_file=holds is None)
     if holds is not None:
-        refuse_as_folder(path)
+        refuse_ending(path)
         refuse_to_lose(path, source if folder is None else folder, holds, WRITTEN)
         place = absolute(path)
         if not is_adapted(place) and any(map(_is_of_a_training, place.glob("point_cloud/*/point_cloud.ply"))):

@@ -1,25 +1,23 @@
-"""Splats read from a PLY of 3DGS, or of a family with the same columns, with what its header and the model folder around it say."""
+"""Splats read from a PLY of 3DGS, or of a family with the same columns, with what its header and its model folder say, and without invalid ones."""
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+from torch import Tensor
+
+from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import recorded_filter, render_mode
-from mipmap_plugin.models.columns import (
-    BRIGHTEST,
-    FILTER_3D,
-    extra_columns,
-    has_bright_colors,
-    holds_halves,
-    notes_on,
-    second_colors,
-    whole_opacities,
-)
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.columns import FILTER_3D, extra_columns, notes_on, notes_on_types
 from mipmap_plugin.models.detect import Checkpoint, detect_as
 from mipmap_plugin.models.exposure import read_exposures
-from mipmap_plugin.models.health import without_invalid
+from mipmap_plugin.models.health import dropped, examine, refuse_few, why_invalid
 from mipmap_plugin.models.inria_folder import companion_notes, read_options, trained_scale
 from mipmap_plugin.models.vanilla import Model, Origin, VanillaModel
 
@@ -44,11 +42,7 @@ def read_splats(checkpoint: Checkpoint, kind: type[Model]) -> Model:
     trained = trained_scale(options, ply.comments)
     screen_filter = trained.screen_filter if recorded_filter(ply.comments) else render_mode(ply.comments)
     origin = Origin(path, sha256(path), folder, checkpoint.iteration, ply.comments, extras, read_exposures(folder))
-    model = kind(parameters, trained, origin, [*checkpoint.notes, *ply.notes, *notes])
-    model.notes += [f"its opacities are whole numbers ({whole}), read as fractions of the largest"] if (whole := whole_opacities(ply.columns)) else []
-    model.notes += ["its columns have 16 bits, read as half-precision floats"] if holds_halves(ply.columns) else []
-    model.notes += [f"its colors are floats above {BRIGHTEST}, read as numbers in 0..255"] if has_bright_colors(ply.columns) else []
-    model.notes += second_colors(ply.columns)
+    model = kind(parameters, trained, origin, [*checkpoint.notes, *ply.notes, *notes, *notes_on_types(ply.columns)])
     del ply  # as large as the model, and no longer needed
     has_filter = FILTER_3D in extras  # whose family knows its screen filter
     taken_as_classic = screen_filter is None and trained.screen_filter == "classic" and not has_filter
@@ -58,3 +52,34 @@ def read_splats(checkpoint: Checkpoint, kind: type[Model]) -> Model:
     model.notes += notes_on(extras)
     model.notes += [FUSED] if "fused" in path.stem and taken_as_classic else []
     return without_invalid(model)
+
+
+def without_invalid(model: Model) -> Model:
+    """The model without splats that are not finite once activated, with a note. Raises CheckpointError if none or few are left (`refuse_few`),
+    and for a file without any.
+
+    Once for each model it warns of what is doubtful (`Health.doubts`), such as positions that float32 does not hold: a file of doubles loses them
+    only here.
+    """
+    health = examine(model)
+    if model.source is not None and not health.splats:
+        raise CheckpointError(f"{model.source} holds no splats; export it again")
+    refuse_few(health.invalid, model.source)
+    for doubt in health.doubts():
+        if doubt not in model.notes:
+            warnings.warn(f"{model.source or 'this model'}: {doubt}", stacklevel=2)
+            model = model.noted(doubt)
+    if not health.invalid.any():
+        return model
+    return drop(model, health.invalid, "; ".join(why_invalid(model, health.invalid)), model.source)
+
+
+def drop(model: Model, mask: Tensor, why: str, source: Path | str | None) -> Model:
+    """A new model without the rows where `mask` [N] is True, with a note and a warning of their number. `source`: where they come from."""
+    return model.keep_rows(~mask).noted(dropped(mask, "splats", why, source))
+
+
+def as_tagged(trained: TrainedScale, comments: Sequence[str]) -> TrainedScale:
+    """`trained` with the screen filter that the comments of an adapted file of another project name (`tags.with_tags`), if they name one."""
+    name, eps2d = recorded_filter(comments) or (render_mode(comments) or trained.screen_filter, trained.eps2d)
+    return replace(trained, screen_filter=name, eps2d=eps2d)

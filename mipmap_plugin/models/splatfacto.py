@@ -23,10 +23,9 @@ from mipmap_plugin.formats.yaml_scalars import read_scalars, with_scalar
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import OPACITY_MARGIN
 from mipmap_plugin.models.detect import detect
-from mipmap_plugin.models.health import without_invalid
 from mipmap_plugin.models.hosts import Capture, as_file, held_out
 from mipmap_plugin.models.places import SPLATFACTO
-from mipmap_plugin.models.tagged import as_tagged
+from mipmap_plugin.models.reading import as_tagged, without_invalid
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.splatting.harmonics import C0
 
@@ -79,7 +78,8 @@ class SplatfactoHost:
     def holds(self, path: Path) -> str | None:
         if path.suffix != ".ckpt":
             return PLACE
-        _refuse_unreadable_name(path)
+        if path.parent.name == PLACE and not re.fullmatch(FILE, path.name):
+            raise OutputError(f"{path}: nerfstudio reads the step from every name in {PLACE}, and would stop at this one; choose another folder")
         return None
 
     def as_trained(self, cameras: Sequence[Camera], capture: Capture, means: Tensor) -> list[Camera]:
@@ -224,8 +224,3 @@ def _shrunk(camera: Camera, factor: float) -> Camera:
     size = dict(width=max(1, int(camera.width / factor)), height=max(1, int(camera.height / factor)))
     lens = {name: getattr(camera, name) / factor for name in ("fx", "fy", "cx", "cy")}
     return replace(camera, **size, **lens)  # type: ignore[arg-type]
-
-
-def _refuse_unreadable_name(path: Path) -> None:
-    if path.parent.name == PLACE and not re.fullmatch(FILE, path.name):
-        raise OutputError(f"{path}: nerfstudio reads the step from every name in {PLACE}, and would stop at this one; choose another folder")

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import Camera, viewmat_of
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.images import image_size, is_file, read_array
 from mipmap_plugin.formats.json_file import numbers, pixels, positive, present, read_json, rotation
@@ -200,6 +200,4 @@ def _of_capture(file: Path, name: str, split: Literal["train", "test"], time: fl
     focal = positive(present(data, "focal_length", str(file)), f"{file}, focal_length")
     sides = numbers(present(data, "image_size", str(file)), (2,), f"{file}, image_size").tolist()
     width, height = (pixels(side, f"{file}, image_size") for side in sides)
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3], viewmat[:3, 3] = turn, -turn @ eye
-    return Camera(width, height, focal, focal, width / 2, height / 2, viewmat, name, split, time)
+    return Camera(width, height, focal, focal, width / 2, height / 2, viewmat_of(turn.T, eye), name, split, time)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import OPENGL_TO_OPENCV, Camera
-from mipmap_plugin.errors import SceneError
+from mipmap_plugin.errors import SceneError, plural
 from mipmap_plugin.formats.images import image_size
 from mipmap_plugin.formats.json_file import ROTATION_TOLERANCE, numbers, pixels, positive, present, read_json, rotation
 from mipmap_plugin.scenes.base import ABSENT, MASKED, Scene, note_on_shapes, other_shape
@@ -111,16 +111,8 @@ def _as_trained(views: list[View], cfg: dict[str, Any]) -> list[View]:
     return trained
 
 
-def _counted(absent: int) -> str:
-    return f"{absent} listed images are" if absent > 1 else "1 listed image is"
-
-
-def _left_out(unsized: int) -> str:
-    """What becomes of the cameras of photographs that are absent; "" if all stay."""
-    if not unsized:
-        return ""
-    cameras = f"{unsized} cameras are" if unsized > 1 else "1 camera is"
-    return f"; {cameras} left out because the file has no w and h"
+def _are(count: int, noun: str) -> str:
+    return f"{plural(count, noun)} {'is' if count == 1 else 'are'}"
 
 
 def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View], list[PurePosixPath], list[str]]:
@@ -133,9 +125,10 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
     views: list[View] = []
     places: list[PurePosixPath] = []
     shapes: list[str] = []
-    absent, passed_over, trained = 0, 0, {place_of(str(name)) for name in names} if isinstance(names := data.get("train_filenames"), list) else None
-    tests = tests if isinstance(tests := data.get("test_frames"), list) else []  # of ScanNet++
-    every = [*frames, *tests]
+    absent = passed_over = 0
+    names, tests = data.get("train_filenames"), data.get("test_frames")  # of nerfstudio, and of ScanNet++
+    trained = {place_of(str(name)) for name in names} if isinstance(names, list) else None
+    every = [*frames, *(tests if isinstance(tests, list) else [])]
     images, copies = listed_images(file, [_listed(frame, f"{file}, frame {index}") for index, frame in enumerate(every)])
     for index, (frame, image) in enumerate(zip(every, images, strict=True)):
         where, listed = f"{file}, frame {index}", str(frame["file_path"])
@@ -145,19 +138,22 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
         image = None if copies and not stated else image  # a copy does not tell the size that the focal length is of
         absent += image is None
         actual = stated if stated and (copies or not image) else image and image_size(image)  # the image itself may have been shrunk since
-        if actual:
-            name = image.stem if image else stem_of(listed)
-            if trained is not None or index >= len(frames):
-                split = "train" if trained is not None and place_of(listed) in trained else "test"
-            if stated and image:
-                shapes.append(other_shape(stated, image, f"{where} ({name})"))
-            model = _lens_model(values, f"{where} ({name})")
-            camera = _camera(values, stated or actual, name, split, f"{where} ({name})").resized(*actual)
-            lens = _lens(values, model, camera, f"{where} ({name})")
-            views.append((lens.straightened(camera) if lens and can_undistort() else camera, image, lens))
-            places.append(place_of(listed))
+        if not actual:
+            continue
+        name = image.stem if image else stem_of(listed)
+        where = f"{where} ({name})"
+        if trained is not None or index >= len(frames):
+            split = "train" if trained is not None and place_of(listed) in trained else "test"
+        if stated and image:
+            shapes.append(other_shape(stated, image, where))
+        model = _lens_model(values, where)
+        camera = _camera(values, stated or actual, name, split, where).resized(*actual)
+        lens = _lens(values, model, camera, where)
+        views.append((lens.straightened(camera) if lens and can_undistort() else camera, image, lens))
+        places.append(place_of(listed))
     unsized = absent - sum(image is None for _, image, _ in views)
-    notes = [f"{file.name}: {_counted(absent)} {ABSENT}{_left_out(unsized)}"] if absent else []
+    left_out = f"; {_are(unsized, 'camera')} left out because the file has no w and h" if unsized else ""
+    notes = [f"{file.name}: {_are(absent, 'listed image')} {ABSENT}{left_out}"] if absent else []
     notes += note_on_shapes(shapes)
     if copies:
         notes.append(f"{file.name}: the images that it lists are not there, and the photographs are those of {copies}")
@@ -200,36 +196,23 @@ def _camera(values: Mapping[str, Any], size: tuple[int, int], name: str, split: 
     fy = _focal(values, "y", height, where) or fx
     cx, cy = principal_point(values, size, where)
     time = numbers(values["time"], (), f"{where}, time").item() if values.get("time") is not None else None
-    return Camera(width, height, fx, fy, cx, cy, _viewmat(values, where), name, split, time)
+    pose = _pose(present(values, "transform_matrix", where), f"{where}, transform_matrix", of_camera=True)
+    return Camera(width, height, fx, fy, cx, cy, viewmat_from_opengl(pose), name, split, time)
 
 
-def _viewmat(values: Mapping[str, Any], where: str) -> Tensor:
-    pose, where = present(values, "transform_matrix", where), f"{where}, transform_matrix"
-    return viewmat_from_opengl(_pose(_unscaled(pose, where), where))
+def _pose(value: Any, where: str, *, of_camera: bool = False) -> Tensor:
+    """A rotation and a translation as [4, 4] float64. Raises SceneError, beginning with `where`.
 
-
-def _unscaled(value: Any, where: str) -> list[list[float]]:
-    """A camera's pose without the scale of its axes: in a modeling program a camera has a size, which no picture shows."""
-    rows = numbers(_upper(value), (3, 4), where)
-    determinant = torch.linalg.det(rows[:, :3]).item()
-    if determinant > 0 and abs(determinant - 1) > ROTATION_TOLERANCE:
-        rows[:, :3] /= determinant ** (1 / 3)
-    listed: list[list[float]] = rows.tolist()
-    return listed
-
-
-def _pose(value: Any, where: str) -> Tensor:
-    """A rotation and a translation as [4, 4] float64. Raises SceneError, beginning with `where`."""
-    upper = numbers(_upper(value), (3, 4), where)
+    `of_camera`: a scale of its axes is left out. In a modeling program a camera has a size, which no picture shows.
+    """
+    upper = numbers(value[:3] if isinstance(value, list) else value, (3, 4), where)  # the last row is 0 0 0 1, and some files leave it out
+    determinant = torch.linalg.det(upper[:, :3]).item()
+    if of_camera and determinant > 0 and abs(determinant - 1) > ROTATION_TOLERANCE:
+        upper[:, :3] /= determinant ** (1 / 3)
     rotation(upper[:, :3].tolist(), where)
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3] = upper
     return pose
-
-
-def _upper(value: Any) -> Any:
-    """The first three rows of a pose: the last one is 0 0 0 1, and some files leave it out."""
-    return value[:3] if isinstance(value, list) else value
 
 
 def _focal(values: Mapping[str, Any], axis: str, size: int, where: str) -> float | None:

@@ -18,6 +18,9 @@ C3 = (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.37317633259
 C4 = (2.5033429417967046, -1.7701307697799304, 0.9461746957575601, -0.6690465435572892, 0.10578554691520431,
       -0.6690465435572892, 0.47308734787878004, -1.7701307697799304, 0.6258357354491761)  # fmt: skip
 
+# Of the factors of a rotation: the last digits depend on where in memory they are computed, and the same file has to give the same bytes.
+DECIMALS = 12
+
 
 def basis(directions: Tensor, degree: int) -> Tensor:
     """Basis functions [N, (degree + 1)²] at unit directions [N, 3]."""
@@ -65,5 +68,6 @@ def rotated(sh: Tensor, rotation: Tensor) -> Tensor:
     directions = torch.randn(4 * sh.shape[1], 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     directions = directions / directions.norm(dim=1, keepdim=True)
     factors: Tensor = torch.linalg.lstsq(basis(directions, degree), basis(directions @ rotation.double(), degree)).solution
+    factors = factors.round(decimals=DECIMALS) + 0.0  # and no -0
     turned: Tensor = factors.to(sh) @ sh
     return turned

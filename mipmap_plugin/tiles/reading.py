@@ -17,7 +17,7 @@ from mipmap_plugin.formats.ply_rows import PlyRows
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.models import Checkpoint, detect
 from mipmap_plugin.models.columns import DC, RGB, extra_names, has_bright_colors, second_colors
-from mipmap_plugin.models.health import MIN_DISTRIBUTION, coarse, doubts, dropped, examine, refuse_few
+from mipmap_plugin.models.health import MIN_DISTRIBUTION, doubts, dropped, examine, refuse_few
 from mipmap_plugin.models.surfels import SurfelModel
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.tiles.cut import cut
@@ -121,4 +121,4 @@ class _Found:
     def doubts(self, splats: int) -> list[str]:
         """As of `Health`, of all splats."""
         linear, activated = map(all, zip(*self.looks, strict=True)) if self.looks else (False, False)
-        return doubts(coarse(self.rounded, splats, self.step), linear, activated)
+        return doubts(splats, self.rounded, self.step, linear, activated)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from anchor_models import LAYOUTS, assert_saved, is_same, load, state_of
 
-from mipmap_plugin.errors import OutputExists
+from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.models import load_model
 
@@ -69,3 +69,9 @@ def test_other_anchors_networks_are_never_replaced_unasked(folder, tmp_path):
     assert is_same(state_of(load_model(folder)), state_of(model))
     model.save(tmp_path / "b" / "a.ply", provenance={}, overwrite=True)
     assert is_same(state_of(load_model(tmp_path / "b" / "a.ply")), state_of(model))
+
+
+def test_a_file_that_is_called_compressed_is_not_written_uncompressed(folder, tmp_path):
+    with pytest.raises(SettingsError, match=r"is not written as compressed PLY; give a \.ply"):
+        load_model(folder).save(tmp_path / "a.compressed.ply", provenance={})
+    assert not (tmp_path / "a.compressed.ply").exists()

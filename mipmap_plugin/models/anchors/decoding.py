@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import linear
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.formats.state_dict import run_layer
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.anchors.networks import EMBEDDING, Weights
 from mipmap_plugin.splatting.harmonics import C0
@@ -44,7 +44,8 @@ def decode(anchors: Anchors, weights: Weights, inputs: Mapping[str, tuple[str, .
         values["appearance"] = _appearance(weights["appearance"][EMBEDDING], camera).expand(len(means), -1)
 
     def run(name: str) -> Tensor:
-        return _two_layers(weights[name], torch.cat([values[key] for key in inputs[name]], dim=1))
+        hidden = run_layer(weights[name], "0", torch.cat([values[key] for key in inputs[name]], dim=1)).relu()
+        return run_layer(weights[name], "2", hidden)
 
     if "feature_bank_mlp" in weights:
         values["features"] = _from_bank(anchors.features, run("feature_bank_mlp").softmax(dim=1))
@@ -56,11 +57,6 @@ def decode(anchors: Anchors, weights: Weights, inputs: Mapping[str, tuple[str, .
     centers = means[row] + anchors.offsets[row, nth] * reach[row]
     scales, quats = size[row] * shapes[:, :3].sigmoid(), unit_quaternions(shapes[:, 3:])
     return Gaussians(centers, quats, scales, opacities[row, nth], (colors[:, None] - 0.5) / C0), row
-
-
-def _two_layers(state: dict[str, Tensor], inputs: Tensor) -> Tensor:
-    hidden = linear(inputs, state["0.weight"], state["0.bias"]).relu()
-    return linear(hidden, state["2.weight"], state["2.bias"])
 
 
 def _from_bank(features: Tensor, shares: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ from mipmap_plugin.models.base import CARRIED, TrainedScale
 from mipmap_plugin.models.columns import NORMAL, POSITION, QUATERNION, numbered, stacked
 from mipmap_plugin.models.detect import detect_as
 from mipmap_plugin.models.health import LARGEST, dropped
-from mipmap_plugin.models.inria_folder import read_options, trained_scale
+from mipmap_plugin.models.inria_folder import read_options, trained_scale, usual_options
 from mipmap_plugin.models.vanilla import Origin
 
 OFFSET, FEATURE = "f_offset_", "f_anchor_feat_"
@@ -143,15 +143,11 @@ def refuse_others(ply: Path, companions: Mapping[str, bytes], source: Path | Non
 
 
 def cfg_text(source: Path | None, target: Path, trained: TrainedScale, options: dict[str, Any]) -> str:
-    """The source's own cfg_args; if there is none, the original's usual options and those that follow from the files.
-
-    Whether views were held out (`eval`) is None then: not known.
-    """
+    """The source's own cfg_args; if there is none, the original's usual options and those that follow from the files."""
     if source is not None and (source / "cfg_args").is_file():
         return cfg_args_text(source / "cfg_args")
-    usual = {"source_path": "", "model_path": str(target), "images": "images", "resolution": trained.resolution, "data_device": "cuda", "eval": None}
     sampling = {"ds": 1, "ratio": 1, "undistorted": False, "white_background": trained.background == (1.0, 1.0, 1.0)}
-    return format_cfg_args({**usual, **sampling, **options})
+    return format_cfg_args({**usual_options(target, trained), **sampling, **options})
 
 
 def needs_views(views: Any) -> None:

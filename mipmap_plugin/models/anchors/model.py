@@ -18,6 +18,7 @@ from mipmap_plugin.effects import Effect
 from mipmap_plugin.errors import ShapeError
 from mipmap_plugin.formats.atomic import together
 from mipmap_plugin.formats.ply import write_ply
+from mipmap_plugin.formats.splat_transform import refuse_ending
 from mipmap_plugin.formats.tags import with_tags
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.anchors.decoding import Anchors, decode
@@ -29,7 +30,7 @@ from mipmap_plugin.models.columns import QUATERNION
 from mipmap_plugin.models.health import LARGEST
 from mipmap_plugin.models.inria_folder import write_folder
 from mipmap_plugin.models.outputs import finite, refuse_parts
-from mipmap_plugin.models.raw import MIN_SCALE
+from mipmap_plugin.models.raw import MIN_SCALE, moved
 from mipmap_plugin.splatting.rotations import unit_quaternions
 
 # Views sampled for the opacities of anchors, and for reshaping: the networks vary slowly with the direction.
@@ -95,7 +96,7 @@ class AnchorModel(ABC):
 
     def to(self, device: torch.device | str) -> AnchorModel:
         """A copy on another device, which requires gradients where this one does."""
-        return self._map(lambda tensor: tensor.detach().to(device, copy=True).requires_grad_(tensor.requires_grad))
+        return self._map(partial(moved, device=device))
 
     def replace_parameters(self, parameters: dict[str, Tensor]) -> None:
         """Use these tensors themselves as leaves, as an optimizer requires. Raises ShapeError."""
@@ -163,10 +164,11 @@ class AnchorModel(ABC):
         return write_folder(path, self.folder, cfg_args, self._read.origin.iteration, overwrite, fill)
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
-        """Check `path` as `save` would. `networks_move`: the networks will change. Raises OutputExists, OutputError."""
+        """Check `path` as `save` would. `networks_move`: the networks will change. Raises OutputExists, OutputError, SettingsError."""
         lone = path.suffix.lower() == ".ply"
         refuse_parts(path, overwrite, self.source, self.folder, None if lone else "point_cloud")
         if lone:
+            refuse_ending(path)  # whose name may end in .compressed.ply
             companions = packed(self._weights, self._read.weights, self._read.companions)
             refuse_others(path, dict.fromkeys(companions, b"") if networks_move else companions, self.source, overwrite)
 

@@ -22,12 +22,11 @@ from mipmap_plugin.formats.yaml_scalars import read_scalars, with_scalar
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.gsplat.frame import normalized_frame
-from mipmap_plugin.models.health import without_invalid
 from mipmap_plugin.models.hosts import Capture, held_out
 from mipmap_plugin.models.places import GSPLAT
+from mipmap_plugin.models.reading import as_tagged, without_invalid
 from mipmap_plugin.models.surfels import NOTE as FLAT_NOTE
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
-from mipmap_plugin.models.tagged import as_tagged
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 
 PLACE, FILE = GSPLAT
@@ -175,13 +174,11 @@ def _shrunk(cameras: Sequence[Camera], factor: int, capture: Capture) -> list[Ca
     assumed = [max(1, int(side / factor + 0.5)) for side in (first.width, first.height)]
     actual = (capture.smaller(factor) if capture.smaller else None) or assumed
     across, down = (size / max(1, whole // factor) for size, whole in zip(actual, (first.width, first.height), strict=True))
-    return [_divided(camera, factor, across, down) for camera in cameras]
-
-
-def _divided(camera: Camera, factor: int, across: float, down: float) -> Camera:
-    width, height = max(1, int(camera.width // factor * across)), max(1, int(camera.height // factor * down))
-    x, y = across / factor, down / factor
-    return replace(camera, width=width, height=height, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y)
+    x, y, shrunk = across / factor, down / factor, list[Camera]()
+    for camera in cameras:
+        width, height = max(1, int(camera.width // factor * across)), max(1, int(camera.height // factor * down))
+        shrunk.append(replace(camera, width=width, height=height, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y))
+    return shrunk
 
 
 def _options_file(folder: Path | None) -> Path | None:

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.nn.functional import linear, relu
+from torch.nn.functional import relu
 
 from mipmap_plugin.errors import CheckpointError
-from mipmap_plugin.formats.state_dict import read_state_dict, require
+from mipmap_plugin.formats.state_dict import read_state_dict, require, run_layer, shapes_of
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.moving.memory import Changes
 from mipmap_plugin.models.moving.model import MovingModel, read_canonical
@@ -69,9 +69,9 @@ class DeformNetwork:
         they have no gradient."""
         moment = embed(means.new_tensor([[time]]), self._frequencies_of_time)
         if self.has_timenet:
-            moment = self._layer("timenet.2", relu(self._layer("timenet.0", moment)))
+            moment = run_layer(self._weights, "timenet.2", relu(run_layer(self._weights, "timenet.0", moment)))
         hidden = self._hidden(means, moment)
-        *motion, turn, growth = (self._layer(head, hidden) for head in self._heads)
+        *motion, turn, growth = (run_layer(self._weights, head, hidden) for head in self._heads)
         return {"means": torch.cat(motion, dim=1), "quats": turn, "scales": growth}
 
     def to(self, device: torch.device | str) -> DeformNetwork:
@@ -86,13 +86,10 @@ class DeformNetwork:
         inputs = torch.cat([embed(means, POSITION_FREQUENCIES), moment.expand(len(means), -1)], dim=1)
         hidden = inputs
         for number in range(self.depth):
-            hidden = self._layer(f"linear.{number}", hidden).relu_()
+            hidden = run_layer(self._weights, f"linear.{number}", hidden).relu_()
             if number == self.depth // 2:
                 hidden = torch.cat([inputs, hidden], dim=1)
         return hidden
-
-    def _layer(self, name: str, inputs: Tensor) -> Tensor:
-        return linear(inputs, self._weights[f"{name}.weight"], self._weights[f"{name}.bias"])
 
     @property
     def _heads(self) -> dict[str, int]:
@@ -110,14 +107,13 @@ class DeformNetwork:
     def _shapes(self) -> dict[str, tuple[int, ...]]:
         """The expected shapes of all layers, given the first."""
         width, inputs = self._weights["linear.0.weight"].shape
-        layers: dict[str, tuple[int, ...]] = {f"linear.{i}": (width, width) for i in range(1, self.depth)}
+        layers = {f"linear.{i}": (width, width) for i in range(1, self.depth)}
         layers[f"linear.{self.depth // 2 + 1}"] = (width, width + inputs)
         layers |= {head: (size, width) for head, size in self._heads.items()}
         if self.has_timenet:
             hidden = len(self._weights["timenet.0.weight"])
             layers |= {"timenet.0": (hidden, 1 + 2 * self._frequencies_of_time), "timenet.2": (inputs - POSITION_INPUTS, hidden)}
-        biases = {f"{name}.bias": shape[:1] for name, shape in layers.items()}
-        return {f"{name}.weight": shape for name, shape in layers.items()} | biases | {"linear.0.bias": (width,)}
+        return shapes_of(layers) | {"linear.0.bias": (width,)}
 
 
 def load_deformable(path: str | Path, *, iteration: int | None = None) -> MovingModel:

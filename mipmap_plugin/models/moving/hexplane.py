@@ -9,10 +9,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample, linear, relu
+from torch.nn.functional import grid_sample, relu
 
 from mipmap_plugin.errors import CheckpointError
-from mipmap_plugin.formats.state_dict import read_state_dict, require
+from mipmap_plugin.formats.state_dict import read_state_dict, require, run_layer, shapes_of
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.inria_folder import read_options
@@ -116,7 +116,7 @@ class HexPlane:
             place = torch.cat([(means - high) * (2 / (low - high)) - 1, moment], dim=1)
             hidden = torch.cat([self._look_up(scale, place) for scale in range(self.scales)], dim=1)
         for layer in range(self.depth):
-            hidden = self._layer(f"feature_out.{2 * layer}", relu(hidden) if layer else hidden)
+            hidden = run_layer(self._weights, f"feature_out.{2 * layer}", relu(hidden) if layer else hidden)
         return hidden
 
     def to(self, device: torch.device | str) -> HexPlane:
@@ -133,10 +133,7 @@ class HexPlane:
         return product
 
     def _head(self, name: str, hidden: Tensor) -> Tensor:
-        return self._layer(f"{name}.3", relu(self._layer(f"{name}.1", relu(hidden))))
-
-    def _layer(self, name: str, inputs: Tensor) -> Tensor:
-        return linear(inputs, self._weights[f"{name}.weight"], self._weights[f"{name}.bias"])
+        return run_layer(self._weights, f"{name}.3", relu(run_layer(self._weights, f"{name}.1", relu(hidden))))
 
     def _is_still(self) -> bool:
         """Whether the field changes nothing: all heads add 0, and none multiplies by an output of the network."""
@@ -157,10 +154,8 @@ class HexPlane:
         layers["feature_out.0"] = (width, 4 if self._options.get("no_grid") else sum(channels.values()))
         for name, size in {**self.heads, **({"static_mlp": 1} if self._options.get("static_mlp") else {})}.items():
             layers |= {f"{name}.1": (width, width), f"{name}.3": (size, width)}
-        shapes: dict[str, tuple[int, ...]] = {f"{name}.weight": shape for name, shape in layers.items()}
-        shapes |= {f"{name}.bias": shape[:1] for name, shape in layers.items()}
-        shapes |= {f"grid.grids.{scale}.{number}": (1, channels[scale], -1, -1) for scale in channels for number in range(len(PLANES))}
-        require(self._weights, shapes, where)
+        planes = {f"grid.grids.{scale}.{number}": (1, count, -1, -1) for scale, count in channels.items() for number in range(len(PLANES))}
+        require(self._weights, shapes_of(layers) | planes, where)
 
 
 def load_hexplane(path: str | Path, *, iteration: int | None = None) -> MovingModel | VanillaModel:
