@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ from mipmap_plugin.commands.types import BackendName, Background, Cameras, Check
 from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.formats.atomic import together
 from mipmap_plugin.formats.here import from_here
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job
@@ -105,7 +107,7 @@ def adapt(
     page = AdaptationPage(checkpoint, [target for *_, target in files], overwrite) if report else None
     models = _adapted(wrapped, left, settings | dict(images=images and scene(replace(base, checkpoint=checkpoint), images)))
     made = _save_all(wrapped, models, page, overwrite, quiet=json)
-    if page:
+    if page and not page.of_one:
         page.write(made, [*before.values()])
     if json:
         print_json([before.get(file[2]) or made.pop(0) for file in files])
@@ -162,23 +164,21 @@ def _save_all(
     base: Wrapped, models: Iterable[tuple[Adapted, Path]], page: AdaptationPage | None, overwrite: bool, *, quiet: bool
 ) -> list[dict[str, Any]]:
     """Save each model as soon as it is adapted, draw it for the page, and print a summary unless `quiet`; return all reports."""
-    reports = []
+    reports = list[dict[str, Any]]()
     for adapted, target in models:
-        reports.append(_saved(adapted, target, overwrite, quiet=quiet))
+        with together(target) if page and page.of_one else nullcontext():  # a file never appears without a page of its own
+            saved = adapted.save(target, overwrite=overwrite)
+            report = adapted.report_of(saved)
+            reports.append({"file": str(saved.absolute()), **report.model_dump()})
+            if page:
+                page.add(base, adapted.as_written(saved))
+            if page and page.of_one:
+                page.write(reports, ())
         if not quiet:
+            _say(saved, report, adapted.model)
             show_before_and_after(base, adapted)
-        if page:
-            page.add(base, adapted.as_written(Path(reports[-1]["file"])))
         del adapted  # before the next is made: its splats, and the truths that its file was measured by, take memory
     return reports
-
-
-def _saved(adapted: Adapted, target: Path, overwrite: bool, *, quiet: bool) -> dict[str, Any]:
-    """Save an adapted model, print a summary unless `quiet`, and return its report."""
-    saved = adapted.save(target, overwrite=overwrite)
-    if not quiet:
-        _say(saved, adapted.report_of(saved), adapted.model)
-    return {"file": str(saved.absolute()), **adapted.report_of(saved).model_dump()}
 
 
 def _requests(scales: Sequence[float], viewers: tuple[str, ...]) -> list[tuple[float, str | None]]:

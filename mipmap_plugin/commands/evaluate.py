@@ -17,7 +17,7 @@ from mipmap_plugin.commands.types import BackendName, Background, Scales, Screen
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.config import ResizeFilter
 from mipmap_plugin.errors import SettingsError, plural
-from mipmap_plugin.formats.atomic import delete, refuse_output, refuse_unwritable, together, write_json
+from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, together, write_json
 from mipmap_plugin.jobs.base import Base
 
 if TYPE_CHECKING:
@@ -129,13 +129,12 @@ class _Results:
         self._rows += means(self._rows) if 1 < len(checkpoints) == len(set(self._scenes)) else []  # several of one scene are compared
         facts = {"rows": records(self._rows), "judged_views": self.judged, "notes": [*self._notes], "report": self._page and str(self._page)}
         written = self._output or self._page
-        with together(written) if written else nullcontext():  # or else, after a kill between the two, one would be in the way
+        kept = [self._kept] if self._kept else []
+        with together(written, kept) if written else nullcontext():  # or else, after a kill between the two, one would be in the way
             if self._page:
                 write_evaluation_page(self._page, checkpoints, self._galleries, self._rows, [*self._notes], overwrite)
             if self._output:
                 write_json(self._output, facts, overwrite)
-        if self._kept:
-            delete(self._kept)
         return facts
 
     def print_tables(self, title: str, dataset: Any) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import print_json
-from mipmap_plugin.commands.pages import PAGE, look_at, write_levels_page
+from mipmap_plugin.commands.pages import look_at, write_levels_page
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import MipmapPluginError, OutputError, SettingsError, plural
 from mipmap_plugin.formats.atomic import settled
@@ -139,6 +139,8 @@ def _ends_at_once(wrapped: Wrapped, request: LadderRequest) -> str:
 
 def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path] = (), json: bool = False) -> None:
     """Print a ladder's manifest, as JSON or in lines."""
+    from mipmap_plugin.models.places import PAGE
+
     if json:
         return print_json(manifest)
     lines = _distances(folder, manifest) if manifest.get("by") == "distance" else _zooms(folder, manifest)

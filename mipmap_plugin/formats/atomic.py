@@ -10,7 +10,7 @@ import math
 import os
 import shutil
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextvars import ContextVar
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -27,32 +27,35 @@ _open: ContextVar[Staging | None] = ContextVar("_open", default=None)
 
 
 @contextlib.contextmanager
-def together(path: Path) -> Iterator[None]:
+def together(path: Path, spent: Iterable[Path] = ()) -> Iterator[None]:
     """Make everything that the block writes to, into or beside `path` one atomic output: it appears if the block succeeds.
 
-    A process that is killed while several files are moved into place leaves a record, from which the next run that writes to `path` or
-    loads it completes the move (`staging`). Raises OutputError.
+    `spent`: files and folders, such as the state of the run, that are removed with that, and else stay. A process that is killed while several
+    files are moved into place leaves a record, from which the next run that writes to `path` or loads it completes all this (`staging`).
+    Raises OutputError.
     """
     with _as_output_error(path):
         place, holding = absolute(path), _open.get()
         if holding is not None and holding.inside(place) is not None:
             yield
+            holding.spent += map(absolute, spent)
             return
         missing = missing_folders(place.parent)
         try:
             place.parent.mkdir(parents=True, exist_ok=True)
-            with _staged(place):
+            with _staged(place, [*map(absolute, spent)]):
                 yield
         finally:
             remove_empty(missing)
 
 
 @contextlib.contextmanager
-def _staged(place: Path) -> Iterator[None]:
+def _staged(place: Path, spent: Sequence[Path]) -> Iterator[None]:
     staging = Staging(place)
     token = _open.set(staging)
     try:
         yield
+        staging.spent += spent
         staging.commit()
     except MipmapPluginError as error:  # which may name the hidden place
         error.args = tuple(str(each).replace(str(staging.new), str(staging.place)) for each in error.args)
@@ -173,11 +176,11 @@ def settled(path: Path) -> Path:
     return path
 
 
-def delete(folder: Path, output: Path | None = None) -> None:
+def delete(folder: Path) -> None:
     """Delete a folder of unfinished work, as far as the system lets this run. It is moved away before, in one step: a part of it, which a killed run
-    leaves, would be in the way of others. Whoever asks for `output`, by default the folder, next removes what is left (`settled`)."""
+    leaves, would be in the way of others. Whoever asks for the folder next removes what is left (`settled`)."""
     with contextlib.suppress(OSError):
-        staging = Staging(absolute(output or folder))
+        staging = Staging(absolute(folder))
         try:
             os.rename(folder, staging.new / folder.name)
         finally:

@@ -131,7 +131,6 @@ def _adapted_and_saved(scene: TiledScene, stages: _Stages, began: float, threads
         report = make_report(scene, files, facts, stages.seconds, validation, returned)
         saved = _save(scene, stages.job, files, Joined(stages.job.target, report, facts))
     close_opened()
-    delete(scene.folder, stages.job.target)
     return saved
 
 
@@ -232,7 +231,7 @@ def _save(scene: TiledScene, job: Job, files: Sequence[Path], joined: Joined) ->
         with new_file(ply, overwrite) as temporary, temporary.open("xb") as out:
             concatenate(files, comments, out)
 
-    with together(job.target):
+    with together(job.target, [scene.folder]):
         if job.target.suffix.lower() == ".ply":
             write(saved := job.target, job.overwrite)
         else:

@@ -191,10 +191,9 @@ def test_a_scale_that_is_interrupted_leaves_the_others_what_they_share(job, monk
 
 def test_a_run_that_is_killed_while_it_deletes_its_tiles_is_in_nobodys_way(job, monkeypatch):
     """What was left of them had no plan, and was taken for other things."""
-    job = replace(job, settings=job.settings | {"steps": 0}, overwrite=True)
-    close = staging.Staging.close
+    job, close = replace(job, settings=job.settings | {"steps": 0}, overwrite=True), staging.Staging.close
     with monkeypatch.context() as patched:
-        patched.setattr(staging.Staging, "close", lambda self: os.close(self._lock) if (self.new / "out.ply.tiles").exists() else close(self))
+        patched.setattr(staging.Staging, "close", lambda self: os.close(self._lock) if self.path == job.target else close(self))
         adapt_in_tiles(job, 2)
     assert not work_folder(job.target).exists() and list(job.target.parent.glob(".out.ply.?.tmp"))
     adapt_in_tiles(job, 2)

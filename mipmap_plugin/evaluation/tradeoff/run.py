@@ -45,5 +45,4 @@ def run(model: Wrapped, scene: Scene | None, scales: Sequence[float], plan: Plan
         again = f"the {count} points measured so far are in {folder.path}; run the same command again to go on"
         raise Interrupted(f"interrupted; {again}") from None
     write(goes_on(folder), tradeoffs, complete=True)
-    cells.remove()
     return tradeoffs
