@@ -118,7 +118,7 @@ class Adapted:
         """What goes when this is written to `path`: the states of its run, and the page that shows what it replaces."""
         path = named(path)
         page = page_at(path.with_name(path.name + PAGE_ENDING)) if path.exists() else []
-        return [state.path for state in self.states] + page
+        return [file for state in self.states for file in state.files] + page
 
     def _judge(self, saved: Path) -> None:
         """Measure a file that is being written, as far as its format rounds splats. Raises CheckpointError if it cannot be read."""

@@ -249,12 +249,15 @@ def sha256(*paths: Path) -> str:
     return digest.hexdigest()
 
 
-def refuse_to_lose(target: Path, source: Path | None, holds: str, ours: Iterable[str]) -> None:
+def refuse_to_lose(target: Path, source: Path | None, holds: str, ours: Sequence[str]) -> None:
     """Raise OutputExists if the folder `target` holds the base checkpoint, is of another kind, or has other things in it.
 
     Replacing a folder deletes its contents. `holds`: what a folder of this kind has. `ours`: patterns (fnmatch) of its files' paths in it.
     """
     place = absolute(target)
+    with _as_output_error(target):
+        for name in {pattern.partition("/")[0] for pattern in ours}:  # written into it by a run that was killed
+            settle(place / name)
     if source is not None and place.is_dir() and any(os.path.samestat(place.stat(), each) for each in _around(source / "x", folders=True)):
         raise OutputExists(f"{target} holds the base checkpoint itself, which --overwrite would delete; choose another folder")
     if place.is_dir() and any(place.iterdir()) and not (place / holds).exists():

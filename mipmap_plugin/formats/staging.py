@@ -99,15 +99,16 @@ def claim(folder: Path) -> int | None:
         if not _locked(lock, made):
             os.close(lock)
             return None
-        if os.path.lexists(folder) and os.path.samestat(os.fstat(lock), os.stat(folder)):
+        if _is_of(lock, folder):
             return lock
         os.close(lock)
 
 
 def release(folder: Path, lock: int) -> None:
-    """Give back what `claim` took, and remove it."""
+    """Give back what `claim` took, and remove it, if it is still there."""
     try:
-        shutil.rmtree(folder, ignore_errors=True)
+        if lock < 0 or _is_of(lock, folder):
+            shutil.rmtree(folder, ignore_errors=True)
     finally:
         if lock >= 0:
             os.close(lock)
@@ -168,6 +169,11 @@ def _locked(lock: int, made: bool) -> bool:
     except OSError:
         return made or _is_stale(os.fstat(lock))
     return True
+
+
+def _is_of(lock: int, folder: Path) -> bool:
+    """Whether the folder is the one of this descriptor, and not another one that has got its name since."""
+    return os.path.lexists(folder) and os.path.samestat(os.fstat(lock), os.stat(folder))
 
 
 def _is_stale(folder: os.stat_result) -> bool:

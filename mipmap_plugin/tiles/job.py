@@ -70,7 +70,7 @@ class TileJob(Job):
     def _adapt(self, tile: Tile) -> None:
         saved, facts, keeper = tile.adapt(state_path(self.target))
         state = keeper and keeper.remaining_file()
-        with together(self.target, [state.path] if state else []):
+        with together(self.target, state.files if state else []):
             save_torch(self.target, saved, overwrite=True)
             write_json(facts_file(self.target), facts, overwrite=True)
         if state:
