@@ -9,6 +9,10 @@ from collections.abc import Sequence
 MAX_LENGTH = 1500
 
 
+# Verbs whose third person is not their plural with an s.
+IRREGULAR = {"are": "is", "were": "was", "have": "has"}
+
+
 def install(extra: str) -> str:
     """How to install an extra, in words for whoever has a clone of the repository and for whoever has none."""
     return f"run pip install '.[{extra}]' in a clone of the repository, or pip install 'mipmap-plugin[{extra}]' elsewhere"
@@ -95,6 +99,13 @@ def with_article(noun: str) -> str:
 def plural(count: int, noun: str) -> str:
     """A number of things: "1 view", "1,200 views"."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
+def some_of(count: int, total: int, noun: str, does: str = "") -> str:
+    """Some of a number of things, and what they do, in words that agree: "2 of 300 splats have no size", "1 of 300 splats has no size"."""
+    verb, _, rest = does.partition(" ")
+    said = IRREGULAR.get(verb, f"{verb}s") if count < 2 and verb else verb
+    return " ".join(filter(None, (f"{count:,} of" if count else "none of", plural(total, noun), said, rest)))
 
 
 def type_of(value: object) -> str:

@@ -15,7 +15,7 @@ import torch
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.errors import SettingsError, unknown
+from mipmap_plugin.errors import SettingsError, some_of, unknown
 from mipmap_plugin.evaluation.cells import Cells, made_by
 from mipmap_plugin.evaluation.measure import (
     FILTERS,
@@ -226,7 +226,7 @@ def _views(config: AdaptConfig, on: str, judged: Sequence[TruthView]) -> dict[st
 def _unseen(judged: Sequence[TruthView], adapted: Adapted) -> str:
     """The part of a row's name that says whether the model was adapted to any of the evaluated views."""
     seen = len(views_seen([view.camera for view in judged], adapted.adapted_to))
-    return f"{seen} of {len(judged)} judged views adapted to" if seen else "held out"
+    return f"{some_of(seen, len(judged), 'judged view')} adapted to" if seen else "held out"
 
 
 def means(rows: Sequence[Row]) -> list[Row]:

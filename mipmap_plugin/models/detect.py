@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mipmap_plugin.errors import CheckpointError, PluginError, type_of
+from mipmap_plugin.errors import CheckpointError, PluginError, plural, type_of
 from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
@@ -178,7 +178,7 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
     if not clouds and (below := _below(folder)):
         more = ", ..." if len(below) > NAMED else ""
         raise CheckpointError(f"{folder} lies above its checkpoint{'s' * (len(below) > 1)}; give {' or '.join(map(str, below[:NAMED]))}{more}")
-    content = f"{len(clouds)} files of splats ({some})" if clouds else f"no point_cloud folder and no file of splats{_instead(folder)}"
+    content = f"{plural(len(clouds), 'file')} of splats ({some})" if clouds else f"no point_cloud folder and no file of splats{_instead(folder)}"
     raise CheckpointError(f"{folder} holds {content}; give one file, or a model folder with point_cloud/iteration_<N>")
 
 

@@ -12,7 +12,7 @@ from typing import Protocol, TypeVar
 import torch
 from torch import Tensor
 
-from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.errors import CheckpointError, some_of
 from mipmap_plugin.models.base import OF_3DGS, SplatModel
 
 Model = TypeVar("Model", bound="IsRead")
@@ -98,14 +98,14 @@ class Health:
         """Remarks for the user; empty for a healthy checkpoint."""
         counts = [
             (int(self.invalid.sum()), f"are not finite once activated, or above {LARGEST:g}, and would spoil images"),
-            (self.zero_quaternions, "have a zero quaternion and are drawn unrotated"),
+            (self.zero_quaternions, "have a zero quaternion: drawn unrotated"),
             (self.huge, f"are longer than the scene ({units(self.extent, 3)} units)"),
             (self.tiny, f"have an axis below {TINY_SHARE:g} of the scene: sheets or needles"),
             (self.sizeless, "have no size: drawn as a dot where splats are dilated without compensation, and nowhere else"),
-            (self.invisible, "have an opacity below 1/255 and are never drawn"),
+            (self.invisible, "have an opacity below 1/255: never drawn"),
             (self.splats * self.faint, "have an opacity below 2 %, as right after training resets them; give a later checkpoint if it is faint"),
         ]
-        remarks = [*self.non_finite(), *(f"{count:,} of {self.splats:,} splats {what}" for count, what in counts if count)]
+        remarks = [*self.non_finite(), *(some_of(count, self.splats, "splat", what) for count, what in counts if count)]
         return remarks + self.doubts()
 
     def spoilt(self) -> bool:
@@ -129,7 +129,7 @@ class Health:
     def non_finite(self) -> list[str]:
         """The sentences on NaN and infinity."""
         counts = [("a NaN", name, n) for name, n in self.nan.items()] + [("an infinity", name, n) for name, n in self.infinite.items()]
-        return [f"{count:,} of {self.splats:,} splats hold {kind} in {name}" for kind, name, count in counts if count]
+        return [some_of(count, self.splats, "splat", f"hold {kind} in {name}") for kind, name, count in counts if count]
 
 
 def doubts(lost: str, linear: bool, activated: bool) -> list[str]:
@@ -141,9 +141,9 @@ def coarse(rounded: int, splats: int, step: float) -> str:
     """`Health.coarse`, of its three numbers."""
     if rounded <= COARSE_SHARE * splats:
         return ""
-    count, remedy = f"{rounded:,} of {splats:,} splats", "export the scene again, moved near the origin together with its cameras"
-    why = f"lie {ROUNDED} to steps of {step:.2g} units, which is much for their size"
-    return f"{count} {why}; {remedy}"
+    remedy = "export the scene again, moved near the origin together with its cameras"
+    lie = f"lie {ROUNDED} to steps of {step:.2g} units, which is much for their size"
+    return f"{some_of(rounded, splats, 'splat', lie)}; {remedy}"
 
 
 def holds_splats(model: SplatModel) -> bool:
@@ -190,14 +190,14 @@ def why_invalid(model: SplatModel, invalid: Tensor) -> list[str]:
     told = torch.stack([*nan.values(), *infinite.values()]).any(0)
     count, sentences = len(invalid), []
     for kind, found in (("a NaN", nan), ("an infinity", infinite)):
-        sentences += [f"{n:,} of {count:,} splats hold {kind} in {name}" for name, each in found.items() if (n := _rows(each))]
-    return sentences + ([f"{n:,} of {count:,} splats are above {LARGEST:g} once activated"] if (n := _rows(~told)) else [])
+        sentences += [some_of(n, count, "splat", f"hold {kind} in {name}") for name, each in found.items() if (n := _rows(each))]
+    return sentences + ([some_of(n, count, "splat", f"are above {LARGEST:g} once activated")] if (n := _rows(~told)) else [])
 
 
 def drop(model: Model, mask: Tensor, why: str, source: Path | str | None) -> Model:
     """A new model without the rows where `mask` [N] is True, with a note and a warning of their number. `source`: where they come from."""
     kept = model.keep_rows(~mask)
-    kept.notes.append(dropped(mask, "splats", why, source))
+    kept.notes.append(dropped(mask, "splat", why, source))
     return kept
 
 
@@ -226,7 +226,7 @@ def refuse_few(invalid: Tensor, source: Path | str | None) -> None:
     count, lost = len(invalid), int(invalid.sum())
     if count and lost >= MOST_DROPPED * count:
         left = count - lost
-        few = f"none of its {count:,} splats is" if left == 0 else f"only {left:,} of its {count:,} splats are"
+        few = "only " * bool(left) + some_of(left, count, "splat", "are")
         order = "its header may name the wrong byte order, or " if str(source).lower().endswith(".ply") else ""
         why = f"{order}the training or the export failed; export it again"
         raise CheckpointError(f"{source or 'this model'}: {few} finite once activated, and below {LARGEST:g}; {why}")
@@ -237,10 +237,9 @@ def doubts_in(notes: Iterable[str]) -> list[str]:
     return [note for note in notes if note in (LINEAR, ACTIVATED) or DROPPED in note or ROUNDED in note]
 
 
-def dropped(mask: Tensor, rows: str, why: str, source: Path | str | None) -> str:
-    """The note that the `rows` where `mask` [N] is True are left out, which is also a warning: what is drawn is not all of the file."""
-    count = int(mask.sum())
-    note = f"{count:,} of {len(mask):,} {rows} {'was' if count == 1 else 'were'} {DROPPED}: {why}"
+def dropped(mask: Tensor, row: str, why: str, source: Path | str | None) -> str:
+    """The note that each `row` where `mask` [N] is True is left out, which is also a warning: what is drawn is not all of the file."""
+    note = f"{some_of(int(mask.sum()), len(mask), row, 'were')} {DROPPED}: {why}"
     warnings.warn(f"{source or 'this model'}: {note}", stacklevel=2)
     return note
 

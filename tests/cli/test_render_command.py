@@ -63,7 +63,7 @@ def test_render_says_that_no_view_shows_anything(run, tmp_path):
     scene = write_cameras(tmp_path / "cameras.json", away)
     code, out, err = run("render", tiny.ply(tmp_path / "a.ply"), "--output", tmp_path / "out", "--cameras", scene)
     assert (code, out) == (0, f"2 pictures in {tmp_path / 'out'}\n")
-    assert "none of the 2 views shows a splat: the cameras seem to be of another scene" in " ".join(err.split())
+    assert "none of 2 views shows a splat: the cameras seem to be of another scene" in " ".join(err.split())
 
 
 def test_render_says_that_its_views_are_generated(run, tmp_path):

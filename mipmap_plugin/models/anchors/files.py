@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mipmap_plugin.errors import CheckpointError, OutputExists, SettingsError
+from mipmap_plugin.errors import CheckpointError, OutputExists, SettingsError, some_of
 from mipmap_plugin.formats.atomic import new_file, sha256
 from mipmap_plugin.formats.cfg_args import cfg_args_text, format_cfg_args
 from mipmap_plugin.formats.ply import read_ply
@@ -173,5 +173,5 @@ def _checked(parameters: dict[str, Tensor], carried: tuple[str, ...], weights: W
     if valid.all():
         return parameters, []
     if not valid.any():
-        raise CheckpointError(f"{where}: none of its {len(valid):,} anchors is finite; the training or the export failed")
-    return {name: tensor[valid] for name, tensor in parameters.items()}, [dropped(~valid, "anchors", "not finite", where)]
+        raise CheckpointError(f"{where}: {some_of(0, len(valid), 'anchor', 'are')} finite; the training or the export failed")
+    return {name: tensor[valid] for name, tensor in parameters.items()}, [dropped(~valid, "anchor", "not finite", where)]
