@@ -165,6 +165,13 @@ def test_the_cameras_are_not_replaced_by_the_rows(folder, capsys):
     assert "never replaced" in capsys.readouterr().err and (folder / "cameras.json").read_bytes() == before
 
 
+def test_a_photograph_is_not_replaced_by_the_rows(folder, capsys):
+    photograph = next((folder / "scene").rglob("*.png"))
+    before = photograph.read_bytes()
+    assert main([*evaluate(folder, photograph.relative_to(folder)), "--overwrite"]) == 2
+    assert "never replaced" in capsys.readouterr().err and photograph.read_bytes() == before
+
+
 def test_rows_and_page_are_two_files(folder, capsys):
     assert main(evaluate(folder, "rows.html")) == 2
     assert "give the rows another name" in capsys.readouterr().err and not (folder / "rows.html").exists()

@@ -81,6 +81,7 @@ def evaluate(
         for name, path, folder, own in zip(_names(checkpoint, images), checkpoint, images, cameras or [None] * len(checkpoint), strict=True):
             base = Base(path, own, background, backend, screen_filter)
             wrapped, photographs = wrap(base, threads), _scene(base, folder, appearance)
+            results.refuse_output([*photographs.images.values()], overwrite)
             results.measure(name, wrapped, photographs, appearance, recipe, settings)
     facts = results.write(checkpoint, overwrite)
     print_json(facts) if json else results.print_tables(_title(checkpoint, images, protocol, results.judged), published)
@@ -100,6 +101,11 @@ class _Results:
     def resumable(self) -> AbstractContextManager[None]:
         """Inside, Ctrl-C says how to go on, and what an earlier command finished is told."""
         return resumable(self._kept, "row")
+
+    def refuse_output(self, read: Sequence[Path], overwrite: bool) -> None:
+        """Raise OutputExists if what is to be written is one of the files that are `read`."""
+        for output in filter(None, (self._output, self._page)):
+            refuse_output(output, overwrite, read, is_file=True)
 
     def measure(self, name: str, wrapped: Wrapped, scene: Scene, appearance: str, recipes: Sequence[str], settings: dict[str, Any]) -> None:
         """Add the rows and notes of one checkpoint, whose rows are called by a name."""

@@ -142,7 +142,7 @@ def refuse_output(path: Path, overwrite: bool, base: Iterable[Path] = (), *, is_
     if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
         raise OutputExists(f"{path} is {kind_of_node(status)}, which is never replaced; choose another path")
     if any(os.path.samestat(status, each) for file in base for each in _around(file, stat.S_ISDIR(status.st_mode))):
-        reason = "holds the base checkpoint itself" if stat.S_ISDIR(status.st_mode) else "is the base checkpoint itself, or a part of it"
+        reason = "holds the base checkpoint itself" if stat.S_ISDIR(status.st_mode) else "is the base checkpoint itself, or read with it"
         raise OutputExists(f"{path} {reason}, which is never replaced; choose another path")
     if is_file and stat.S_ISDIR(status.st_mode):
         raise OutputExists(f"{path} is a folder, which no file replaces; choose the path of a file")
