@@ -30,7 +30,7 @@ class Registry:
         """Register `target` under `name`. Raises SettingsError if another target has the name already, or it is no name."""
         if not isinstance(name, str) or not name or not name.isprintable() or name != name.strip():
             raise SettingsError(f"{self.group}: a name is a text of a line, got {name!r}")
-        if not replace and self._targets.get(name, target) != target:
+        if not replace and self._targets.get(name, target) is not target and self._targets[name] != target:
             raise SettingsError(f"{self.group}: the name {name!r} is taken; pass replace=True to override it")
         self._targets[name] = target
 

@@ -111,7 +111,7 @@ def axis_of(up: str) -> tuple[float, float, float]:
 
 def check_serves(backend: str, threads: int | None) -> None:
     """Raise SettingsError for a backend that does not exist, and for no number of threads, before anything is loaded."""
-    if backend != "auto":
+    if not isinstance(backend, str) or backend != "auto":
         BACKENDS.get(backend)
     if threads is not None:
         checked_threads(threads)

@@ -54,7 +54,7 @@ def detect(path: str | Path, *, iteration: int | None = None) -> Checkpoint:
     In a folder, the newest `iteration_<N>` whose PLY is complete is used, or `iteration`.
     Raises CheckpointError for a path that is missing, damaged, or not a checkpoint.
     """
-    if path == "":
+    if isinstance(path, str) and not path:
         raise CheckpointError("no path was given; give a PLY file or a model folder")
     path = settled(path_of(path))
     if path.is_dir():

@@ -88,7 +88,7 @@ def test_render_refuses_names_that_are_not_there_and_pictures_that_are(run, mode
     words = ["render", model_folder, "--output", tmp_path / "out", "--view", "view_1"]
     assert run(*words)[0] == 0
     refused(run(*words), "train_view_1.png exists already; pass --overwrite")
-    refused(run(*words, "--overwrite", "--supersampling", "0"), "supersampling: must be at least 1")
+    refused(run(*words, "--overwrite", "--supersampling", "0"), "supersampling must be a whole number of at least 1")
     assert run(*words, "--overwrite")[0] == 0
 
 

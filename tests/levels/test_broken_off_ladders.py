@@ -236,7 +236,8 @@ def test_an_export_that_failed_is_made_by_the_same_command(tmp_path, monkeypatch
         failing.setattr(Exports, "write", lambda *_: (_ for _ in ()).throw(OutputError("the disk is full")))
         assert cli.main(words) == 2
     assert "ladder has the levels, and the same command goes on from these" in capsys.readouterr().err
-    (tmp_path / "ladder" / ".report.html.0.tmp" / "new").mkdir(parents=True)  # of a run that was killed as it wrote its page
+    (tmp_path / "ladder" / ".report.html.0.tmp" / "new").mkdir(parents=True)
+    (tmp_path / "ladder" / ".report.html.0.tmp" / "new" / "report.html").touch()  # of a run that was killed as it wrote its page
     assert cli.main([*words, "--seed", "1"]) == 2  # another ladder does not replace it
     assert "holds levels of another base, viewer or settings" in capsys.readouterr().err
     assert cli.main(words) == 0 and {path.name for path in tmp_path.iterdir()} == {"base", "ladder"}
