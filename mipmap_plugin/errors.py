@@ -3,7 +3,13 @@
 import difflib
 import errno
 import re
+import sys
+import traceback
+import warnings
 from collections.abc import Sequence
+
+# The name of this package.
+PACKAGE = __name__.partition(".")[0]
 
 # Maximum characters of a message. A damaged file that it quotes may have megabytes in place of a name or a number.
 MAX_LENGTH = 1500
@@ -60,6 +66,17 @@ class OutputExists(MipmapPluginError, FileExistsError):
 
 class JobsFailed(MipmapPluginError):
     """Some of many jobs failed; the others are done."""
+
+
+class MipmapPluginWarning(UserWarning):
+    """All that this package warns of."""
+
+
+def warn(text: str, category: type[Warning] = MipmapPluginWarning) -> None:
+    """Warn at the line that called this package, however deep in it the reason was found."""
+    frames = list(traceback.walk_stack(sys._getframe(1)))
+    ours = [number for number, (frame, _) in enumerate(frames) if frame.f_globals.get("__name__", "").partition(".")[0] == PACKAGE]
+    warnings.warn(text, category, stacklevel=max(ours, default=0) + 3)
 
 
 # What the names of temporary folders begin with.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from mipmap_plugin.commands.common import print_json
 from mipmap_plugin.commands.pages import look_at, write_levels_page
 from mipmap_plugin.commands.voice import say
-from mipmap_plugin.errors import MipmapPluginError, OutputError, SettingsError, plural
+from mipmap_plugin.errors import MipmapPluginError, OutputError, SettingsError, plural, warn
 from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.formats.here import size_in_bytes
 from mipmap_plugin.formats.splat_transform import LOD_META, refuse_exchange
@@ -89,7 +88,7 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     if exports.tiles:
         refuse_far(output, wrapped.model.parameters(), "leave --tiles out")
     if not wrapped.cameras:
-        warnings.warn(NO_CAMERAS, stacklevel=2)
+        warn(NO_CAMERAS)
     ladder = _made(wrapped, request, unfinished)
     if exports.streamed_sog and len(ladder.levels) == 1:
         # Other numbers would make another ladder, and a smaller --coarsest may make more levels that are left out.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Protocol, TypeVar
 import torch
 from torch import Tensor
 
-from mipmap_plugin.errors import CheckpointError, some_of
+from mipmap_plugin.errors import CheckpointError, some_of, warn
 from mipmap_plugin.models.base import OF_3DGS, SplatModel
 
 Model = TypeVar("Model", bound="IsRead")
@@ -214,7 +213,7 @@ def without_invalid(model: Model) -> Model:
     refuse_few(health.invalid, model.source)
     for doubt in health.doubts():
         if doubt not in model.notes:
-            warnings.warn(f"{model.source or 'this model'}: {doubt}", stacklevel=2)
+            warn(f"{model.source or 'this model'}: {doubt}")
             model = model.noted(doubt)
     if not health.invalid.any():
         return model
@@ -240,7 +239,7 @@ def doubts_in(notes: Iterable[str]) -> list[str]:
 def dropped(mask: Tensor, row: str, why: str, source: Path | str | None) -> str:
     """The note that each `row` where `mask` [N] is True is left out, which is also a warning: what is drawn is not all of the file."""
     note = f"{some_of(int(mask.sum()), len(mask), row, 'were')} {DROPPED}: {why}"
-    warnings.warn(f"{source or 'this model'}: {note}", stacklevel=2)
+    warn(f"{source or 'this model'}: {note}")
     return note
 
 
