@@ -12,7 +12,7 @@ from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import OF_SPLATS, Family, Files, Match
-from mipmap_plugin.models.places import PARTS, REPORT
+from mipmap_plugin.models.places import PARTS, REPORT, has_report
 from mipmap_plugin.models.zipped_folder import opened, retold, told
 
 # Suffixes of files of splats besides PLY, and of photographs.
@@ -127,7 +127,7 @@ def _most_certain(files: Files, claims: dict[str, tuple[Family, Match]], notes: 
 
 def _why_not(files: Files) -> str:
     path, kind = files.path, files.kind
-    if path.suffix.lower() not in OWN_SUFFIXES and path.with_name(path.name + REPORT).is_file():
+    if path.suffix.lower() not in OWN_SUFFIXES and has_report(path):
         remedy = "install the package that adds that family (`mipmap-plugin list families` shows which are found), or give the file its ending again"
         return f"{path} was adapted from a checkpoint of a family that is not installed here, or knows its files by another ending; {remedy}"
     if files.header:
@@ -167,7 +167,7 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
         raise CheckpointError(f"{folder} has no point_cloud/iteration_{iteration}; give the model folder above it, or no iteration")
     files = sorted(folder.iterdir())
     clouds = [file for file in files if file.suffix.lower() == ".ply"] or [file for file in files if _is_exchanged(file)]
-    clouds = [cloud for cloud in clouds if not cloud.with_name(cloud.name + REPORT).exists()] or clouds  # no adaptations, where there is a base
+    clouds = [cloud for cloud in clouds if not has_report(cloud)] or clouds  # no adaptations, where there is a base
     if len(clouds) > 1 and folder / "point_cloud.ply" in clouds:
         clouds = [folder / "point_cloud.ply"]
     if len(clouds) == 1:

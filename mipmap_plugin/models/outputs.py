@@ -20,7 +20,7 @@ from mipmap_plugin.formats.spz import fraction_for
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.health import COARSE_SHARE, COARSE_STEP, rows_where
-from mipmap_plugin.models.places import CONVERTED, PARTS, REPORT, STATE
+from mipmap_plugin.models.places import CONVERTED, PARTS, REPORT, STATE, has_report
 
 # What is written into a model folder, of all families.
 WRITTEN = (
@@ -173,4 +173,4 @@ def _belongs(name: str, source: str) -> bool:
 def is_adapted(file: Path) -> bool:
     """Whether a file is the output of an adaptation, its report or the state of its run. Raises OutputError for a root."""
     file = named(file)
-    return file.name.endswith((REPORT, STATE, STATE + CONVERTED)) or file.with_name(file.name + REPORT).exists()
+    return file.name.endswith((REPORT, STATE, STATE + CONVERTED)) or has_report(file)

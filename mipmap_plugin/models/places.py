@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -68,6 +69,11 @@ def state_path(output: Path) -> Path:
 def conversion_state(state: Path) -> Path:
     """The path of the state of the conversion before a run with that `state` (`adaptation.conversion`)."""
     return state.with_name(state.name + CONVERTED)
+
+
+def has_report(file: Path) -> bool:
+    """Whether the report of an adaptation lies beside a file; none does where its name would be too long."""
+    return os.path.isfile(file.with_name(file.name + REPORT))
 
 
 def page_at(path: Path) -> list[Path]:
