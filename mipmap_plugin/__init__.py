@@ -47,7 +47,15 @@ __all__ = list(_HOME)
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    try:
+        return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    except Exception as error:
+        from mipmap_plugin.errors import PluginError
+        from mipmap_plugin.registry import unreadable_package
+
+        if reason := unreadable_package():
+            raise PluginError(reason) from error
+        raise
 
 
 def __dir__() -> list[str]:

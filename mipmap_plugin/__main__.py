@@ -14,6 +14,13 @@ def run() -> int:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         sys.stderr.write("mipmap-plugin: interrupted\n")
         return 130
+    except Exception:
+        from mipmap_plugin.registry import unreadable_package
+
+        if not (reason := unreadable_package()):
+            raise
+        sys.stderr.write(f"mipmap-plugin: {reason}\n")
+        return 2
     finally:  # Ctrl-C would only break off what removes temporary files, and Python would tell of that
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 

@@ -1,10 +1,10 @@
-"""What the numbers of render settings, of packings and of viewers may be. Others draw nothing, or fail in a kernel."""
+"""What the numbers of effects, of render settings, of packings and of viewers may be. Others draw nothing, or fail in a kernel."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any
 
 from mipmap_plugin.errors import SettingsError
@@ -26,6 +26,15 @@ def _range(value: Any) -> bool:
     return numbers and value[0] < value[1] and 0 < value[2] <= value[1] - value[0]
 
 
+def _whole(value: Any, least: int) -> bool:
+    return isinstance(value, Integral) and int(value) >= least
+
+
+def _color(value: Any) -> bool:
+    return isinstance(value, (tuple, list)) and len(value) == 3 and all(_number(part) and math.isfinite(part) for part in value)
+
+
+BOOL: Rule = "True or False", lambda value: isinstance(value, bool)
 POSITIVE: Rule = "a number above 0", lambda value: _number(value) and value > 0
 SIZE: Rule = "a number of at least 0", lambda value: _number(value) and 0 <= value < math.inf
 ANY_SIZE: Rule = "a number of at least 0, or infinity", lambda value: _number(value) and value >= 0
@@ -51,12 +60,25 @@ OF_SETTINGS: Mapping[str, Rule] = {
     "frame": POSITIVE,
     "linear_light": ("a power from 1 to 4", lambda value: _number(value) and 1 <= value <= 4),
     "picture_step": STEP,
+    **dict.fromkeys(("fades", "radial", "bucketed", "boxed", "rooted", "fits_picture", "frozen_by_width"), BOOL),
+}
+
+# px² of the image, and world units.
+OF_EFFECTS: Mapping[str, Rule] = {
+    "sh_degree": ("a whole number of at least 0", lambda value: _whole(value, 0)),
+    "screen_filter": ("the name of a screen filter", lambda value: isinstance(value, str)),
+    "eps2d": SIZE,
+    "background": ("three finite numbers", _color),
+    "supersampling": ("a whole number of at least 1, of samples along each axis of a pixel", lambda value: _whole(value, 1)),
+    "near_plane": SIZE,
+    "exposure": BOOL,
 }
 
 # 24 bits, as many as float32 tells apart.
 OF_EVEN_BUCKETS: Mapping[str, Rule] = {
     "steps": ("a whole number from 1 to 16,777,216", lambda value: type(value) is int and 1 <= value <= 1 << 24),
     "sphere_from": SIZE,
+    **dict.fromkeys(("later_in_front", "largest_first"), BOOL),
 }
 
 OF_PACKING: Mapping[str, Rule] = {
@@ -64,7 +86,8 @@ OF_PACKING: Mapping[str, Rule] = {
     "color": STEP,
     "bands": STEPS,
     "log_scales": ("a minimum, a larger maximum, and a step between them", _range),
-    "quats": ("'octahedral' or 'stereographic'", lambda value: value in ("octahedral", "stereographic")),
+    "quats": ("'octahedral' or 'stereographic'", lambda value: isinstance(value, str) and value in ("octahedral", "stereographic")),
+    **dict.fromkeys(("downwards", "half_means"), BOOL),
 }
 
 # px² and world units. A dilation of more than a picture shows nothing but fog.

@@ -105,7 +105,7 @@ class Camera:
         if not isinstance(self.name, (str, Path)):
             raise SettingsError(f"camera: name must be a text, got {self.name!r}")
         object.__setattr__(self, "name", str(self.name))
-        if self.split not in ("train", "test"):
+        if not isinstance(self.split, str) or self.split not in ("train", "test"):
             raise SettingsError(f"camera {self.name!r}: split must be 'train' or 'test', got {self.split!r}")
         kinds: dict[str, Callable[[Any], Any]] = {"time": float, "zoom": float, "base_zoom": float, "index": index}
         for name, kind in kinds.items():
@@ -138,7 +138,7 @@ class Camera:
         value = getattr(self, name)
         try:
             return kind(None if isinstance(value, str) else value)
-        except (TypeError, ValueError, OverflowError) as error:
+        except (TypeError, ValueError, OverflowError, RuntimeError) as error:
             what = "a whole number" if kind is index else "a number"
             raise SettingsError(f"camera {self.name!r}: {name} must be {what}, got {value!r}") from error
 
@@ -239,7 +239,7 @@ def _matrix(name: str, given: Any, shape: tuple[int, int]) -> Tensor:
     """A copy of a tensor or an array as float64 on the CPU. Raises ShapeError."""
     given = given.detach() if isinstance(given, Tensor) else given
     try:
-        matrix = torch.as_tensor(given, dtype=torch.float64, device="cpu").clone()
+        matrix = torch.as_tensor(given, dtype=torch.float64, device="cpu").to_dense().clone()
     except (TypeError, ValueError, RuntimeError) as error:
         raise ShapeError(f"{name}: expected a tensor or an array of shape {list(shape)}, got {type(given).__name__}") from error
     if tuple(matrix.shape) != shape:
@@ -272,7 +272,7 @@ def every_nth(views: Sequence[Item], most: int) -> Sequence[Item]:
 
 def checked(cameras: Any, *, some: bool = False) -> list[Camera]:
     """Cameras as a list, of at least one if there have to be `some`. Raises SettingsError for anything else."""
-    found = list(cameras) if isinstance(cameras, Iterable) and not isinstance(cameras, (str, bytes)) else [cameras]
+    found = list(cameras) if isinstance(cameras, Iterable) and getattr(cameras, "ndim", True) and not isinstance(cameras, (str, bytes)) else [cameras]
     if wrong := [each for each in found if not isinstance(each, Camera)]:
         of_a_file = isinstance(wrong[0], (str, Path))
         advice = "those of a file are load_scene(path).cameras" if of_a_file else "Camera.of_matrices and Camera.of_opengl make them of arrays"

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
+from mipmap_plugin.allowed import OF_EFFECTS, check
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError, unknown
 from mipmap_plugin.gaussians import Gaussians
@@ -55,15 +57,11 @@ class Effects:
     exposure: bool = False
 
     def __post_init__(self) -> None:
-        if wrong := [name for name in self.outputs if name not in list(OUTPUTS)]:
+        check("effects", self, OF_EFFECTS, optional=frozenset())
+        if wrong := [name for name in as_outputs(self.outputs) if not isinstance(name, str) or name not in OUTPUTS]:
             raise SettingsError(unknown("output", str(wrong[0]), [*OUTPUTS]))
-        if len(self.background) != 3 or not all(map(math.isfinite, self.background)):
-            raise SettingsError(f"background must be three finite numbers, got {self.background!r}")
-        if not 0 <= self.eps2d < math.inf or self.sh_degree < 0 or self.supersampling < 1:
-            got = f"eps2d {self.eps2d}, sh_degree {self.sh_degree} and supersampling {self.supersampling}"
-            raise SettingsError(f"eps2d and sh_degree must be at least 0, and supersampling at least 1, got {got}")
-        if not 0 <= self.near_plane < math.inf:
-            raise SettingsError(f"near_plane must be a number of at least 0, got {self.near_plane}")
+        if not isinstance(self.settings, RenderSettings):
+            raise SettingsError(f"effects: settings must be RenderSettings, got {type(self.settings).__name__}")
 
 
 @dataclass(frozen=True)
@@ -98,9 +96,10 @@ MODEL_EFFECTS = (
 
 def as_outputs(names: Sequence[str] | None) -> tuple[str, ...]:
     """What is rendered besides the image, as `Effects.outputs`. Raises SettingsError for what is no sequence, and for a text, which is one too."""
-    if names is not None and (isinstance(names, str) or not isinstance(names, Iterable)):
-        raise SettingsError(f"outputs must be a sequence of names, such as ['depth'], got {names!r}")
-    return tuple(names or ())
+    if not isinstance(names, str):
+        with suppress(TypeError):
+            return () if names is None else tuple(names)
+    raise SettingsError(f"outputs must be a sequence of names, such as ['depth'], got {names!r}")
 
 
 def explain(

@@ -3,10 +3,20 @@
 import difflib
 import errno
 import re
+import sys
+import traceback
+import warnings
 from collections.abc import Sequence
+
+# The name of this package.
+PACKAGE = __name__.partition(".")[0]
 
 # Maximum characters of a message. A damaged file that it quotes may have megabytes in place of a name or a number.
 MAX_LENGTH = 1500
+
+
+# Verbs whose third person is not their plural with an s.
+IRREGULAR = {"are": "is", "were": "was", "have": "has"}
 
 
 def install(extra: str) -> str:
@@ -58,6 +68,17 @@ class JobsFailed(MipmapPluginError):
     """Some of many jobs failed; the others are done."""
 
 
+class MipmapPluginWarning(UserWarning):
+    """All that this package warns of."""
+
+
+def warn(text: str, category: type[Warning] = MipmapPluginWarning) -> None:
+    """Warn at the line that called this package, however deep in it the reason was found."""
+    frames = list(traceback.walk_stack(sys._getframe(1)))
+    ours = [number for number, (frame, _) in enumerate(frames) if frame.f_globals.get("__name__", "").partition(".")[0] == PACKAGE]
+    warnings.warn(text, category, stacklevel=max(ours, default=0) + 3)
+
+
 # What the names of temporary folders begin with.
 TEMPORARY = "mipmap-plugin-"
 
@@ -95,6 +116,13 @@ def with_article(noun: str) -> str:
 def plural(count: int, noun: str) -> str:
     """A number of things: "1 view", "1,200 views"."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
+def some_of(count: int, total: int, noun: str, does: str = "") -> str:
+    """Some of a number of things, and what they do, in words that agree: "2 of 300 splats have no size", "1 of 300 splats has no size"."""
+    verb, _, rest = does.partition(" ")
+    said = IRREGULAR.get(verb, f"{verb}s") if count < 2 and verb else verb
+    return " ".join(filter(None, (f"{count:,} of" if count else "none of", plural(total, noun), said, rest)))
 
 
 def type_of(value: object) -> str:

@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, SupportsIndex, cast
+from typing import Any, cast
 
 import torch
 from typing_extensions import TypedDict, Unpack
@@ -134,10 +134,8 @@ class FrozenBase:
         check_names("render", options, RenderOptions, ("scale", "screen_filter", "supersampling"))
         viewer, exposure = options.get("viewer"), options.get("exposure", False)
         scale = check_scale(scale)
-        if not isinstance(supersampling, SupportsIndex) or supersampling < 1:
-            raise SettingsError(f"supersampling: must be at least 1 sample per pixel along each axis, got {supersampling!r}")
-        check_image(camera.width * supersampling, camera.height * supersampling, self.model.parameters()["means"].device)
         effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=outputs, exposure=exposure)
+        check_image(camera.width * supersampling, camera.height * supersampling, self.model.parameters()["means"].device)
         backend, _ = self.backend(screen_filter=screen_filter, viewer=viewer)
         form = self._smoothed if options.get("filter_3d") else None
         with threads.limited(self.threads, shared=False) if self.threads is not None else nullcontext():
@@ -224,11 +222,11 @@ class FrozenBase:
             self.images = BaseImages(model, backend, self.effects(), LIMIT if keep else 0)
         return self.images
 
-    def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = True, viewer: str | None = None) -> None:
+    def refuse_output(self, path: str | Path, *, overwrite: bool, networks_move: bool = True, viewer: str | None = None) -> None:
         """Raise now the error that saving a model adapted for `viewer` to `path` would raise at the end, as far as it can be predicted."""
         source, parts = self.model.source, parts_of(self.model.source, self.model.folder)
         model = cast(Filtered, self.model).bare() if viewer is not None and self.model.traits.filtered else self.model
-        refuse_unread(path, [own_name(name) for name in viewers_for(viewer)] if viewer else [])
+        refuse_unread(path := path_of(path), [own_name(name) for name in viewers_for(viewer)] if viewer else [])
         with naming_any({f"family {model.family!r}": model}):
             model.refuse_output(path, overwrite=overwrite, networks_move=networks_move)
         refuse_output(named(path).with_name(named(path).name + REPORT), overwrite, parts, is_file=True)
@@ -278,11 +276,12 @@ class FrozenBase:
 
     def refuse_undrawn(self, views: Sequence[Camera] | None = None, scale: float = 1.0) -> None:
         """Raise SettingsError if none of the views, by default the base's own, shows anything of it at `scale` (`refuse_blind`)."""
-        refuse_blind(self.views() if views is None else views, self.model, self.effects().near_plane, lambda view: self.render(view).image, scale)
+        scale, views = check_scale(scale), self.views() if views is None else checked(views, some=True)
+        refuse_blind(views, self.model, self.effects().near_plane, lambda view: self.render(view).image, scale)
 
     def place(self, scene: Scene) -> Scene:
         """Return the scene in the model's frame (`placed`); a checkpoint that came without cameras gets those of the scene."""
-        in_frame = placed(self.model, scene, self.cameras)
+        in_frame = placed(self.model, scene := scene_of(self.model, scene), self.cameras)
         if in_frame is not scene and not self.cameras:
             self.cameras = list(in_frame.cameras)
         return in_frame

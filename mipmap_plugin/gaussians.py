@@ -37,6 +37,10 @@ class Gaussians:
         given = {field.name: getattr(self, field.name) for field in fields(self)}
         if wrong := [name for name, tensor in given.items() if not isinstance(tensor, Tensor) and (tensor is not None or name != "covariances")]:
             raise ShapeError(f"{wrong[0]}: expected a torch tensor, got {type(given[wrong[0]]).__name__}")
+        if wrong := [name for name, tensor in given.items() if tensor is not None and (tensor.layout != torch.strided or tensor.is_nested)]:
+            raise ShapeError(f"{wrong[0]}: expected a dense tensor, got a sparse or nested one; give its to_dense()")
+        if not self.means.is_floating_point():
+            raise ShapeError(f"means: expected floating-point numbers, got {self.means.dtype}; give float32")
         n = self.means.shape[0] if self.means.dim() else 0
         bands = math.isqrt(self.sh.shape[1]) if self.sh.dim() == 3 else 0
         expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, max(bands, 1) ** 2, 3)}

@@ -28,7 +28,7 @@ def check_scale(scale: Any) -> float:
     """Return a number of any type as a scale. Raises SettingsError for what is no number, or out of range."""
     try:
         number = math.nan if isinstance(scale, (str, bool)) else float(scale)
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, OverflowError, RuntimeError):
         number = math.nan
     if not MIN_SCALE <= number <= MAX_SCALE:  # also for NaN
         got = f"{scale:g}" if isinstance(scale, float) else repr(scale)[:40]
@@ -39,8 +39,8 @@ def check_scale(scale: Any) -> float:
 
 def path_of(path: Any, name: str = "path") -> Path:
     """Return what was given as a path, "~" as the home folder. Raises SettingsError for anything else than a path, and for an empty one."""
-    if not isinstance(path, (str, Path)) or path == "":
-        got = "an empty text" if path == "" else type(path).__name__
+    if not isinstance(path, (str, Path)) or not str(path):
+        got = "an empty text" if isinstance(path, str) else type(path).__name__
         raise SettingsError(f"{name} must be a text such as 'output/bicycle', or a pathlib.Path, got {got}")
     try:
         return Path(path).expanduser()
@@ -74,7 +74,7 @@ def check_background(background: Sequence[float]) -> tuple[float, float, float]:
     """Return the color. Raises SettingsError if it is not three numbers from 0 to 1."""
     try:
         color = tuple(float(channel) for channel in background)
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, OverflowError, RuntimeError):
         color = ()
     if len(color) != 3 or not all(0 <= channel <= 1 for channel in color):
         raise SettingsError(f"background must be three numbers from 0 to 1, such as (1, 1, 1), got {background!r}")

@@ -9,10 +9,10 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, distributions, entry_points
 from typing import Any
 
-from mipmap_plugin.errors import PluginError, SettingsError, unknown
+from mipmap_plugin.errors import PluginError, SettingsError, brief, unknown
 
 
 class Registry:
@@ -30,7 +30,7 @@ class Registry:
         """Register `target` under `name`. Raises SettingsError if another target has the name already, or it is no name."""
         if not isinstance(name, str) or not name or not name.isprintable() or name != name.strip():
             raise SettingsError(f"{self.group}: a name is a text of a line, got {name!r}")
-        if not replace and self._targets.get(name, target) != target:
+        if not replace and self._targets.get(name, target) is not target and self._targets[name] != target:
             raise SettingsError(f"{self.group}: the name {name!r} is taken; pass replace=True to override it")
         self._targets[name] = target
 
@@ -72,6 +72,17 @@ class Registry:
 
     def _installed(self) -> Mapping[str, str]:
         return _points(entry_points, self.group, tuple((folder, _modified(folder)) for folder in sys.path))
+
+
+def unreadable_package() -> str:
+    """Which installed package has entry points that cannot be read, in a sentence; "" if none: pydantic then fails as it is imported."""
+    for package in distributions():
+        try:
+            package.entry_points  # noqa: B018
+        except Exception as error:
+            name = f"{package.metadata['Name']} {package.version}"
+            return f"the entry points of the installed package {name} cannot be read ({brief(error)}); install it anew, or remove it"
+    return ""
 
 
 def _package(point: EntryPoint) -> str:

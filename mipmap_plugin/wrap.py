@@ -9,7 +9,6 @@ from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
-from warnings import warn
 
 from typing_extensions import TypedDict, Unpack
 
@@ -19,7 +18,7 @@ from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrup
 from mipmap_plugin.adaptation.target.photographs import placed
 from mipmap_plugin.backends import BACKENDS, device_for
 from mipmap_plugin.camera import Camera, digest_of, of_base_scale
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, warn
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.frozen_base import RenderOptions as RenderOptions
 from mipmap_plugin.levels.finished import Ladder
@@ -96,7 +95,7 @@ def wrap_model(
     found, read_from = _found(model, cameras)
     given = found.cameras if isinstance(found, Scene) else found
     if up is not None and given:
-        warn(f"up {up}: there are cameras, whose views are taken; it is of use only where an orbit is asked for (views 'orbit')", stacklevel=3)
+        warn(f"up {up}: there are cameras, whose views are taken; it is of use only where an orbit is asked for (views 'orbit')")
     wrapped = Wrapped(model, placed(model, found).cameras if isinstance(found, Scene) else given, backend, trained, threads)
     wrapped.loading_s, wrapped.asked, wrapped.cameras_from = loading_s, asked_for(model.folder, given, color, screen_filter, up), read_from
     return wrapped
@@ -111,7 +110,7 @@ def axis_of(up: str) -> tuple[float, float, float]:
 
 def check_serves(backend: str, threads: int | None) -> None:
     """Raise SettingsError for a backend that does not exist, and for no number of threads, before anything is loaded."""
-    if backend != "auto":
+    if not isinstance(backend, str) or backend != "auto":
         BACKENDS.get(backend)
     if threads is not None:
         checked_threads(threads)
@@ -124,7 +123,7 @@ def _found(model: SplatModel, cameras: Sequence[Camera] | Scene | str | Path | N
     if isinstance(cameras, Scene):
         if cameras.is_capture and (project := exporter(model.source)):
             frames = f"{model.source} is in the frame that {project} trained in, and {cameras.source} most often in another: views may show nothing"
-            warn(f"{frames}; adapt the folder of the run, which has its checkpoint and options, with these cameras", stacklevel=4)
+            warn(f"{frames}; adapt the folder of the run, which has its checkpoint and options, with these cameras")
         return cameras, where(cameras.source, model.folder)
     if cameras is not None:
         return of_base_scale(cameras), {}

@@ -226,7 +226,7 @@ def test_photographs_that_are_nowhere_are_missed_beside_the_model(tmp_path):
     write_text_model(tmp_path / "scene/sparse/0", names(1))
     write_photographs(tmp_path / "images", names(1))  # of another scene
     for folder in ("scene", "scene/sparse", "scene/sparse/0"):
-        assert f"absent from {tmp_path / 'scene/images'};" in " ".join(load_scene(tmp_path / folder).notes)
+        assert f"absent from {tmp_path / 'scene/images'}," in " ".join(load_scene(tmp_path / folder).notes)
 
 
 BENT = {"SIMPLE_RADIAL": "70 32 24 0.1", "OPENCV": "70 72 32 24 0 0 0.01 0", "OPENCV_FISHEYE": "70 72 32 24 0 0 0 0"}

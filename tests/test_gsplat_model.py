@@ -182,7 +182,7 @@ class Hostile:
         (lambda s: {name: s[name] for name in NAMES[:-1]}, "expected are means"),
         (lambda s: {**s, "opacities": s["opacities"][:, None]}, "opacities: expected shape"),
         (lambda s: {**s, "shN": s["shN"][:, :2]}, "fit no SH degree"),
-        (lambda s: {**s, "means": s["means"] * math.nan}, "none of its 30 splats is finite"),
+        (lambda s: {**s, "means": s["means"] * math.nan}, "none of 30 splats is finite"),
         (lambda s: {name: tensor[:0] for name, tensor in s.items()}, "a.pt holds no splats; export it again"),
         (lambda s: {**s, "means": 7}, "means should be tensors"),
         (lambda s: [s], "no dictionary of splats"),

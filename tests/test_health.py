@@ -43,10 +43,10 @@ def test_a_healthy_model_has_nothing_to_report():
 @pytest.mark.parametrize(
     ("name", "value", "sentence"),
     [
-        ("quats", [0.0] * 4, "1 of 200 splats have a zero quaternion"),
-        ("scales", [9.0, 0, 0], "1 of 200 splats are longer than the scene"),
-        ("scales", [-30.0, 0, 0], "1 of 200 splats have an axis below"),
-        ("opacities", -6.0, "1 of 200 splats have an opacity below 1/255"),
+        ("quats", [0.0] * 4, "1 of 200 splats has a zero quaternion"),
+        ("scales", [9.0, 0, 0], "1 of 200 splats is longer than the scene"),
+        ("scales", [-30.0, 0, 0], "1 of 200 splats has an axis below"),
+        ("opacities", -6.0, "1 of 200 splats has an opacity below 1/255"),
     ],
 )
 def test_oddities_are_counted_and_kept(name, value, sentence):
@@ -98,7 +98,7 @@ def test_poison_in_one_row_is_dropped_at_load_with_a_note(tmp_path, field, value
     if (field == "opacities" and not math.isnan(value)) or (field == "scales" and value == -math.inf):  # opacity 0 or 1, length 0
         assert len(model) == 8 and not model.notes
         return
-    assert model.notes[0] == f"1 of 8 splats was dropped: 1 of 8 splats hold {'a NaN' if math.isnan(value) else 'an infinity'} in {field}"
+    assert model.notes[0] == f"1 of 8 splats was dropped: 1 of 8 splats holds {'a NaN' if math.isnan(value) else 'an infinity'} in {field}"
     rows = [i for i in range(8) if i != 3]
     np.testing.assert_array_equal(model.parameters()["means"], np.stack([columns[axis][rows] for axis in "xyz"], 1))
 
@@ -146,7 +146,7 @@ def test_a_file_of_which_little_is_finite_is_refused_and_the_byte_order_named(tm
     columns = splat_columns(100)
     columns["x"][left:] = 1e20
     path = write(tmp_path / "a.ply", columns)
-    few = f"only {left} of its 100 splats are" if left else "none of its 100 splats is"
+    few = f"only {left} of 100 splats are" if left else "none of 100 splats is"
     told = rf"a.ply: {few} finite once activated, and below 1e\+12; its header may name the wrong byte order, or the training .* export it again"
     with pytest.raises(CheckpointError, match=told) if left < 21 else pytest.warns(UserWarning, match="79 of 100 splats were dropped"):
         load_vanilla(path)
@@ -214,7 +214,7 @@ def test_only_what_dropped_splats_hold_is_told(tmp_path):
     columns = splat_columns(8)
     columns["x"][3], columns["opacity"][3:5], columns["f_dc_0"][6], columns["scale_0"][7] = np.nan, np.inf, 1e13, -np.inf
     model = load_vanilla(write(tmp_path / "a.ply", columns))
-    told = "1 of 8 splats hold a NaN in means; 1 of 8 splats are above 1e+12 once activated"
+    told = "1 of 8 splats holds a NaN in means; 1 of 8 splats is above 1e+12 once activated"
     assert model.notes == [f"2 of 8 splats were dropped: {told}"]
 
 

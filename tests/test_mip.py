@@ -164,7 +164,7 @@ def test_rows_whose_filter_is_no_length_are_dropped(tmp_path):
     model = load_model(folder(tmp_path / "model", columns=columns))
     assert len(model) == 36 and any("4 of 40 splats were dropped" in note for note in model.notes)
     columns["filter_3D"][:] = np.nan
-    with pytest.raises(CheckpointError, match="none of its 40 splats"):
+    with pytest.raises(CheckpointError, match="none of 40 splats"):
         load_model(folder(tmp_path / "broken", columns=columns))
 
 

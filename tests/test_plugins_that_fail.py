@@ -1,7 +1,10 @@
 """Plug-ins that break their contract: a sentence names them, the base stays as it was, and nothing wrong passes for a result."""
 
 import copy
+import os
+import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -289,3 +292,18 @@ def test_a_viewer_that_cannot_be_loaded_hides_no_other():
 def test_an_empty_list_of_cameras_is_no_wish_for_an_orbit(cameras):
     with pytest.raises(SettingsError, match="cameras: there are none"):
         wrap_model(tiny.model(), cameras=tiny.cameras(2)).adapt(0.5, cameras=cameras)
+
+
+@pytest.mark.parametrize(("text", "code"), [
+    (b"[any]\nmine\n", "import mipmap_plugin; mipmap_plugin.register_recipe"),
+    (b"\xff\xfe[any]\n", "from mipmap_plugin.__main__ import run; exit(run())"),
+])  # fmt: skip
+def test_a_package_whose_entry_points_cannot_be_read_is_named(tmp_path, text, code):
+    """Which nothing that reads entry points survives, pydantic among them."""
+    folder = tmp_path / "stranger-1.0.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1.0\n")
+    (folder / "entry_points.txt").write_bytes(text)
+    paths = os.pathsep.join([*filter(None, [os.environ.get("PYTHONPATH")]), str(Path(__file__).parents[1]), str(tmp_path)])
+    ended = subprocess.run([sys.executable, "-c", code, "list"], env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True)
+    assert "the entry points of the installed package stranger 1.0 cannot be read" in ended.stderr.splitlines()[-1], ended.stderr

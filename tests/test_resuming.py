@@ -20,6 +20,7 @@ from mipmap_plugin.evaluation.cells import Cells, made_by
 from mipmap_plugin.evaluation.evaluate import _adapted_rows, training_free_rows
 from mipmap_plugin.evaluation.measure import adapt_alone
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
+from mipmap_plugin.formats import staging
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.recipes import RECIPES
 from mipmap_plugin.wrap import wrap_model
@@ -108,7 +109,7 @@ def test_a_folder_with_other_things_is_not_deleted(folder, capsys, command):
 
 def test_rows_of_another_background_are_measured_again(folder, monkeypatch):
     """Which is not in the checkpoint's own bytes."""
-    monkeypatch.setattr("mipmap_plugin.commands.evaluate.delete", lambda _: None)
+    monkeypatch.setattr(staging, "_remove", lambda *_: None)
     psnrs = []
     for white in (False, True):
         options = folder / "base" / "cfg_args"
@@ -119,7 +120,7 @@ def test_rows_of_another_background_are_measured_again(folder, monkeypatch):
 
 def test_rows_of_another_truth_are_measured_again(folder, monkeypatch):
     """As of an older version, whose protocol made another of the same photographs."""
-    monkeypatch.setattr("mipmap_plugin.commands.evaluate.delete", lambda _: None)
+    monkeypatch.setattr(staging, "_remove", lambda *_: None)
     rows = []
     for truncate in (False, True, True):
         monkeypatch.setitem(PROTOCOLS, "P1", replace(PROTOCOLS["P1"], truncate=truncate))
@@ -132,8 +133,7 @@ def test_what_another_recipe_of_that_name_made_is_measured_again(folder, monkeyp
     """One's own recipe, edited after an interruption."""
     words = [command, str(folder / "base"), "--images", str(folder / "scene"), "--scale", "1/2", "--recipe", "mine"]
     words += ["--no-picture", "--no-renderers", "--repeats", "1", "--supersampling", "2"] if command == "tradeoff" else []
-    for kept in ("commands.evaluate", "evaluation.cells"):
-        monkeypatch.setattr(f"mipmap_plugin.{kept}.delete", lambda _: None)
+    monkeypatch.setattr(staging, "_remove", lambda *_: None)
     made, counts = [], []
     place = f"mipmap_plugin.evaluation.{module}.adapt_alone"
     monkeypatch.setattr(place, lambda *args, **settings: made.append(args) or adapt_alone(*args, **settings))
@@ -163,6 +163,13 @@ def test_the_cameras_are_not_replaced_by_the_rows(folder, capsys):
     before = (folder / "base" / "cameras.json").rename(folder / "cameras.json").read_bytes()
     assert main([*evaluate(folder, "cameras.json"), "--cameras", str(folder / "cameras.json"), "--overwrite"]) == 2
     assert "never replaced" in capsys.readouterr().err and (folder / "cameras.json").read_bytes() == before
+
+
+def test_a_photograph_is_not_replaced_by_the_rows(folder, capsys):
+    photograph = next((folder / "scene").rglob("*.png"))
+    before = photograph.read_bytes()
+    assert main([*evaluate(folder, photograph.relative_to(folder)), "--overwrite"]) == 2
+    assert "never replaced" in capsys.readouterr().err and photograph.read_bytes() == before
 
 
 def test_rows_and_page_are_two_files(folder, capsys):

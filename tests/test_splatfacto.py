@@ -192,7 +192,7 @@ class Hostile:
         ({"_model.field.weight": torch.zeros(2, 3)}, "lacks means"),
         ({**splatfacto_state(splats()), "_model.gauss_params.quats": torch.zeros(30, 3)}, "quats: expected shape"),
         ({**splatfacto_state(splats()), "_model.gauss_params.features_rest": torch.zeros(30)}, "do not fit together"),
-        ({**splatfacto_state(splats()), "_model.gauss_params.means": torch.full((30, 3), math.nan)}, "none of its 30 splats is finite"),
+        ({**splatfacto_state(splats()), "_model.gauss_params.means": torch.full((30, 3), math.nan)}, "none of 30 splats is finite"),
         ({**splatfacto_state(splats()), "_model.hook": Hostile()}, "is not executed"),
         ([], "no pipeline"),
     ],

@@ -22,7 +22,7 @@ from mipmap_plugin.backends.base import Backend, Rendered
 from mipmap_plugin.camera import Camera, checked
 from mipmap_plugin.effects import Effects, as_outputs, explain
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.formats.atomic import refuse_output, staged, together, write_json
+from mipmap_plugin.formats.atomic import named, refuse_output, staged, together, write_json
 from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_image, path_of
@@ -31,7 +31,7 @@ from mipmap_plugin.models.base import SplatModel, checked_splats, digest_of_mode
 from mipmap_plugin.models.exposure import exposed
 from mipmap_plugin.models.mip import for_loader_of, unread
 from mipmap_plugin.models.outputs import cut_off, drawn_otherwise, parts_of, without_place
-from mipmap_plugin.models.places import REPORT
+from mipmap_plugin.models.places import PAGE_ENDING, REPORT, page_at
 from mipmap_plugin.plugin_errors import naming_any, unchanged
 from mipmap_plugin.process.torch_modes import in_usual_modes, usual_modes
 from mipmap_plugin.progress import announced
@@ -102,17 +102,23 @@ class Adapted:
         path = path_of(path)
         refuse_output(path, overwrite, parts_of(self.model.source, self.model.folder))  # whatever the family itself looks at
         family = {f"family {self.model.family!r}": self.model}
-        with usual_modes(), together(path), naming_any(family):  # a new model never appears without its report
+        with usual_modes(), together(path, self._spent(path)), naming_any(family):  # a new model never appears without its report
             model = for_loader_of(self.report.viewer, self.model, path)
             with announced(f"writing {path.name}"):
                 saved = contract.save(model, path, self.report.provenance(), overwrite=overwrite)
             self._judge(saved)
             write_json(saved.with_name(saved.name + REPORT), self.report_of(saved).model_dump(), overwrite=overwrite)
         for state in self.states:
-            state.remove()
+            state.release()
         for said in filter(None, (unread(self.report.viewer, self.model, saved), self._rounded(saved), self._drawn_otherwise(saved))):
             warn(said)
         return saved
+
+    def _spent(self, path: Path) -> list[Path]:
+        """What goes when this is written to `path`: the states of its run, and the page that shows what it replaces."""
+        path = named(path)
+        page = page_at(path.with_name(path.name + PAGE_ENDING)) if path.exists() else []
+        return [file for state in self.states for file in state.files] + page
 
     def _judge(self, saved: Path) -> None:
         """Measure a file that is being written, as far as its format rounds splats. Raises CheckpointError if it cannot be read."""
@@ -125,7 +131,7 @@ class Adapted:
 
     def as_written(self, path: Path) -> Adapted:
         """This with the splats and the report of the file at `path`, whose format may round them."""
-        return replace(self, model=self._read(path) if is_written(path) else self.model, report=self.report_of(path))
+        return replace(self, model=self._read(staged(path)) if is_written(path) else self.model, report=self.report_of(path))
 
     def _read(self, file: Path) -> SplatModel:
         with warnings.catch_warnings():

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 from mipmap_plugin.camera import Camera, digest_of
-from mipmap_plugin.errors import MipmapPluginError, is_temporary
+from mipmap_plugin.errors import MipmapPluginError, is_temporary, warn
 from mipmap_plugin.models.adapted_scale import report_beside
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.zipped_folder import opened, told
@@ -57,6 +56,6 @@ def _of_base(source: Path | None) -> tuple[list[Camera] | Scene, dict[str, str]]
     except (MipmapPluginError, OSError) as error:
         reason = str(error)
     if reason:
-        warnings.warn(f"{source} was adapted with cameras that are not found any more ({reason}): {GONE}", stacklevel=3)
+        warn(f"{source} was adapted with cameras that are not found any more ({reason}): {GONE}")
         return None
     return found, report["cameras_from"]

@@ -16,7 +16,7 @@ from mipmap_plugin.adaptation.optimization.validation import HARM_DB
 from mipmap_plugin.adaptation.parallel import in_batches
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera, evenly
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, some_of
 from mipmap_plugin.limits import check_image
 from mipmap_plugin.models.base import SplatModel, places
 from mipmap_plugin.models.contract import row_opacities
@@ -122,7 +122,7 @@ def refuse_blind(views: Sequence[Camera], model: SplatModel, near: float, image_
             wrong = "all splats in view have an opacity below 1/255 and are never drawn; the training or the export failed"
         elif showing(some, means, 0.0):
             wrong = f"all splats lie nearer than {near:g} units, where renderers of 3DGS draw none; {SCALE_UP}"
-        raise SettingsError(f"none of the {len(views)} views shows a splat: {wrong}")
+        raise SettingsError(f"{some_of(0, len(views), 'view', 'show')} a splat: {wrong}")
 
 
 def _draws(view: Camera, model: SplatModel, near: float) -> bool:
@@ -155,7 +155,7 @@ def worse_views(views: Sequence[Camera], before: Sequence[float], after: Sequenc
     if not any(worse) or sum(after) < sum(before):
         return []
     then, now = max(compress(zip(before, after, strict=True), worse), key=lambda pair: pair[0] - pair[1])
-    where = f"in {sum(worse)} of the {len(views)} views that it was chosen by, the file for x{scale:g} looks worse than the base"
+    where = f"in {some_of(sum(worse), len(views), 'view')} that it was chosen by, the file for x{scale:g} looks worse than the base"
     told = f"{where}, by up to {then - now:.1f} dB as far as differences can be seen ({then:.1f} -> {now:.1f}), though it gains by their mean"
     shortest, longer = min(map(_focal, views)), min(map(_focal, compress(views, worse)))
     if longer >= LONGER * shortest:

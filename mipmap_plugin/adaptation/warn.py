@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+
+from mipmap_plugin import errors
 
 # Not a filter of Python's warnings, which all threads have in common.
 _silent: ContextVar[bool] = ContextVar("_silent", default=False)
 
 
 def warn(text: str) -> None:
-    """Warn whoever called the function that calls this one, unless it is inside `silent`."""
+    """`errors.warn`, unless this is inside `silent`."""
     if not _silent.get():
-        warnings.warn(text, stacklevel=3)
+        errors.warn(text)
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,7 +10,7 @@ import torch
 
 from mipmap_plugin.backends.base import API_VERSION, Backend, Needs
 from mipmap_plugin.backends.guarded import Guarded
-from mipmap_plugin.errors import BackendUnavailable, PluginError, SettingsError, type_of
+from mipmap_plugin.errors import BackendUnavailable, PluginError, SettingsError, type_of, warn
 from mipmap_plugin.plugin_errors import is_third_party
 from mipmap_plugin.registry import Registry
 
@@ -108,7 +107,7 @@ def _fastest(reasons_of: dict[str, list[str]]) -> Backend | None:
 def _warn_of_numba(chosen: str, reasons: Sequence[str]) -> None:
     """Say that a working numba would save much time, where the backend cpu lacks nothing else."""
     if chosen == "reference" and len(reasons) == 1 and "numba" in reasons[0]:
-        warnings.warn(f"backend cpu cannot do this: {reasons[0]}; the backend reference takes its place, many times slower", stacklevel=3)
+        warn(f"backend cpu cannot do this: {reasons[0]}; the backend reference takes its place, many times slower")
 
 
 def _lacking(name: str, backend: Backend, needs: Sequence[Needs]) -> list[str]:

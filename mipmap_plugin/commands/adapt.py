@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ from mipmap_plugin.commands.types import BackendName, Background, Cameras, Check
 from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.formats.atomic import together
 from mipmap_plugin.formats.here import from_here
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job
@@ -105,7 +107,7 @@ def adapt(
     page = AdaptationPage(checkpoint, [target for *_, target in files], overwrite) if report else None
     photographs = images and scene(replace(base, checkpoint=checkpoint), images)
     made = _made(wrapped, left, settings | dict(images=photographs), page, overwrite, json)
-    if page:
+    if page and not page.of_one:
         page.write(made, [*before.values()])
     if json:
         print_json([before.get(file[2]) or made.pop(0) for file in files])
@@ -156,14 +158,17 @@ def _made(base: Wrapped, files: Sequence[File], settings: dict[str, Any], page: 
     base.keeps_images, reports = len(files) > 1, list[Facts]()
     for scale, viewer, target in files:
         adapted = base.adapt(scale, viewer=viewer, resume=state_path(target), **settings)
-        saved = adapted.save(target, overwrite=overwrite)
-        report = adapted.report_of(saved)
-        reports.append({"file": str(saved.absolute()), **report.model_dump()})
+        with together(target) if page and page.of_one else nullcontext():  # a file never appears without a page of its own
+            saved = adapted.save(target, overwrite=overwrite)
+            report = adapted.report_of(saved)
+            reports.append({"file": str(saved.absolute()), **report.model_dump()})
+            if page:
+                page.add(base, adapted.as_written(saved))
+            if page and page.of_one:
+                page.write(reports, ())
         if not quiet:
             _say(saved, report, adapted.model)
             show_before_and_after(base, adapted)
-        if page:
-            page.add(base, adapted.as_written(saved))
         del adapted  # before the next is made: its splats, and the truths that its file was measured by, take memory
     return reports
 

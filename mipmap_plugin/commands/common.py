@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import shlex
-import warnings
 from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.voice import put, say
+from mipmap_plugin.errors import warn
 from mipmap_plugin.formats.atomic import json_text
 from mipmap_plugin.formats.here import from_here
 from mipmap_plugin.process.garbage import leave_loaded, uncollected
@@ -57,7 +57,7 @@ def scene(base: Base, path: Path) -> Scene:
     """The scene at `path`, whose photographs judge a checkpoint; a warning tells of absent and masked ones. Raises CheckpointError, SceneError."""
     read = base.photographs(path)
     for note in read.warnings():
-        warnings.warn(f"{path}: {note}", stacklevel=2)
+        warn(f"{path}: {note}")
     return read
 
 

@@ -17,7 +17,7 @@ from mipmap_plugin.commands.types import BackendName, Background, Scales, Screen
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.config import ResizeFilter
 from mipmap_plugin.errors import SettingsError, plural
-from mipmap_plugin.formats.atomic import delete, refuse_output, refuse_unwritable, together, write_json
+from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, together, write_json
 from mipmap_plugin.jobs.base import Base
 
 if TYPE_CHECKING:
@@ -81,6 +81,7 @@ def evaluate(
         for name, path, folder, own in zip(_names(checkpoint, images), checkpoint, images, cameras or [None] * len(checkpoint), strict=True):
             base = Base(path, own, background, backend, screen_filter)
             wrapped, photographs = wrap(base, threads), _scene(base, folder, appearance)
+            results.refuse_output([*photographs.images.values()], overwrite)
             results.measure(name, wrapped, photographs, appearance, recipe, settings)
     facts = results.write(checkpoint, overwrite)
     print_json(facts) if json else results.print_tables(_title(checkpoint, images, protocol, results.judged), published)
@@ -96,6 +97,11 @@ class _Results:
         self._rows, self._notes, self._galleries = list[Any](), dict[str, None](), list[Any]()  # notes each once, in their order
         self.judged = list[int]()  # the number of judged views of each checkpoint
         self._scenes = list[Path]()
+
+    def refuse_output(self, read: Sequence[Path], overwrite: bool) -> None:
+        """Raise OutputExists if what is to be written is one of the files that are `read`."""
+        for output in filter(None, (self._output, self._page)):
+            refuse_output(output, overwrite, read, is_file=True)
 
     def measure(self, name: str, wrapped: Wrapped, scene: Scene, appearance: str, recipes: Sequence[str], settings: dict[str, Any]) -> None:
         """Add the rows and notes of one checkpoint, whose rows are called by a name."""
@@ -127,13 +133,12 @@ class _Results:
         self._rows += means(self._rows) if 1 < len(checkpoints) == len(set(self._scenes)) else []  # several of one scene are compared
         facts = {"rows": records(self._rows), "judged_views": self.judged, "notes": [*self._notes], "report": self._page and str(self._page)}
         written = self._output or self._page
-        with together(written) if written else nullcontext():  # or else, after a kill between the two, one would be in the way
+        kept = [self.kept] if self.kept else []
+        with together(written, kept) if written else nullcontext():  # or else, after a kill between the two, one would be in the way
             if self._page:
                 write_evaluation_page(self._page, checkpoints, self._galleries, self._rows, [*self._notes], overwrite)
             if self._output:
                 write_json(self._output, facts, overwrite)
-        if self.kept:
-            delete(self.kept)
         return facts
 
     def print_tables(self, title: str, dataset: Any) -> None:

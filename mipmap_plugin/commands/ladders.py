@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import print_json
-from mipmap_plugin.commands.pages import PAGE, look_at, write_levels_page
+from mipmap_plugin.commands.pages import look_at, write_levels_page
 from mipmap_plugin.commands.voice import say
-from mipmap_plugin.errors import MipmapPluginError, OutputError, SettingsError, plural
+from mipmap_plugin.errors import MipmapPluginError, OutputError, SettingsError, plural, warn
 from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.formats.here import size_in_bytes
 from mipmap_plugin.formats.splat_transform import LOD_META, refuse_exchange
@@ -86,7 +85,7 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     if exports.tiles:
         refuse_far(output, wrapped.model.parameters(), "leave --tiles out")
     if not wrapped.cameras:
-        warnings.warn(NO_CAMERAS, stacklevel=2)
+        warn(NO_CAMERAS)
     with _kept(unfinished):
         ladder = make_levels(wrapped, request, resume=unfinished)
     if exports.streamed_sog and len(ladder.levels) == 1:
@@ -129,6 +128,8 @@ def _ends_at_once(wrapped: Wrapped, request: LadderRequest) -> str:
 
 def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path] = (), json: bool = False) -> None:
     """Print a ladder's manifest, as JSON or in lines."""
+    from mipmap_plugin.models.places import PAGE
+
     if json:
         return print_json(manifest)
     lines = _distances(folder, manifest) if manifest.get("by") == "distance" else _zooms(folder, manifest)

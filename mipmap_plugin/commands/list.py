@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import tyro
 
 from mipmap_plugin.commands.common import print_facts, print_json
-from mipmap_plugin.errors import MipmapPluginError
+from mipmap_plugin.errors import MipmapPluginError, warn
 from mipmap_plugin.process.garbage import uncollected
 
 if TYPE_CHECKING:
@@ -46,7 +45,7 @@ def warn_of_other_groups() -> None:
     for group in sorted(points.groups):
         if group.startswith("mipmap_plugin.") and group not in known:
             names = ", ".join(sorted({f"{point.name} ({point.value})" for point in points.select(group=group)}))
-            warnings.warn(f"{names}, in the group {group} of entry points, is not used: the groups are {', '.join(known)}", stacklevel=2)
+            warn(f"{names}, in the group {group} of entry points, is not used: the groups are {', '.join(known)}")
 
 
 def _facts(kind: Kind) -> dict[str, Any]:

@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from mipmap_plugin.pages.gallery import Gallery
     from mipmap_plugin.wrap import Wrapped
 
-# The page in the folder of a ladder or of a tradeoff.
-PAGE = "report.html"
-
 
 def look_at(page: Path) -> str:
     """The line that says where a page is."""
@@ -57,8 +54,8 @@ class AdaptationPage:
         from mipmap_plugin.models.places import PAGE_ENDING
 
         name = checkpoint.resolve().name
-        folder = targets[0].resolve().parent
-        self.path = folder / f"{targets[0].resolve().name if len(targets) == 1 else f'{name}_adapted'}{PAGE_ENDING}"
+        folder, self.of_one = targets[0].resolve().parent, len(targets) == 1
+        self.path = folder / f"{targets[0].resolve().name if self.of_one else f'{name}_adapted'}{PAGE_ENDING}"
         self._title, self._overwrite, self._zooms = name, overwrite, list[Any]()
         refuse_output(self.path, overwrite, is_file=True)
         refuse_unwritable(self.path)
@@ -80,26 +77,27 @@ class AdaptationPage:
 
 def tradeoff_page_path(folder: Path, overwrite: bool) -> Path:
     """The page in the folder of a tradeoff. Raises OutputExists."""
+    from mipmap_plugin.models.places import PAGE
+
     refuse_output(folder / PAGE, overwrite, is_file=True)
     return folder / PAGE
 
 
-def write_tradeoff_page(page: Path | None, checkpoint: Path, base: Wrapped, tradeoffs: Sequence[Tradeoff], overwrite: bool) -> Path | None:
-    """Write the page of a tradeoff, unless `page` is None, and return it."""
-    if page is None:
-        return None
+def write_tradeoff_page(page: Path, checkpoint: Path, base: Wrapped, overwrite: bool, tradeoffs: Sequence[Tradeoff]) -> None:
+    """Write the page of a tradeoff."""
     from mipmap_plugin.evaluation.tradeoff.files import facts
     from mipmap_plugin.pages.html import write_page
     from mipmap_plugin.pages.reports import tradeoff_page
 
     title = f"{checkpoint.resolve().name}: accuracy and time"
-    return write_page(page, tradeoff_page(title, base, facts(tradeoffs, complete=True), (this_command(),)), overwrite)
+    write_page(page, tradeoff_page(title, base, facts(tradeoffs, complete=True), (this_command(),)), overwrite)
 
 
 def write_levels_page(folder: Path, ladder: Contents | DistanceContents, title: str) -> Path:
     """Write the page of a ladder into its folder."""
     from mipmap_plugin.levels.distance.manifest import Contents as DistanceContents
     from mipmap_plugin.levels.manifest import read_manifest
+    from mipmap_plugin.models.places import PAGE
     from mipmap_plugin.pages.html import write_page
     from mipmap_plugin.pages.levels import levels_page
     from mipmap_plugin.pages.walks import walks_page

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from mipmap_plugin.commands.common import base_cameras, wrap
 from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, OwnScale, Up, Viewer
 from mipmap_plugin.commands.voice import say
-from mipmap_plugin.errors import SettingsError, plural
+from mipmap_plugin.errors import SettingsError, plural, warn
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.progress import counted
@@ -96,7 +95,7 @@ def _tell_if_not_drawn(wrapped: Wrapped, viewer: str) -> None:
     from mipmap_plugin.models.base import why_no_viewer
 
     if reason := why_no_viewer(wrapped.model):
-        warnings.warn(f"{viewer}: {reason}; the pictures show what its settings would make of these splats", stacklevel=1)
+        warn(f"{viewer}: {reason}; the pictures show what its settings would make of these splats")
 
 
 def _told_by_file(scale: float, viewer: str | None) -> str:
@@ -113,7 +112,7 @@ def _check(wrapped: Wrapped, views: Sequence[Camera], exposure: bool) -> None:
     try:
         wrapped.refuse_undrawn(views)
     except SettingsError as error:
-        warnings.warn(str(error), stacklevel=1)
+        warn(str(error))
 
 
 def _at_times(wrapped: Wrapped, views: Sequence[Camera], times: Sequence[float]) -> list[Camera]:

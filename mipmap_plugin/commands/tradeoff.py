@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -83,8 +85,12 @@ def tradeoff(
     model, photographs = wrap(base, threads), scene(base, images) if images else None
     _check(model, plan, scale)
     with resumable(output / KEPT, "cell"):
-        tradeoffs = run(model, photographs, unique_scales(scale), plan, views, folder)
-    _print(tradeoffs, folder, write_tradeoff_page(page, checkpoint, model, tradeoffs, overwrite), json)
+        tradeoffs = run(model, photographs, unique_scales(scale), plan, views, _with_page(folder, page, checkpoint, model))
+    _print(tradeoffs, folder, page, json)
+
+
+def _with_page(folder: Folder, page: Path | None, checkpoint: Path, model: Wrapped) -> Folder:
+    return folder if page is None else replace(folder, page=partial(write_tradeoff_page, page, checkpoint, model, folder.overwrite))
 
 
 def _check(model: Wrapped, plan: Plan, scales: Sequence[float]) -> None:

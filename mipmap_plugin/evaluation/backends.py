@@ -12,7 +12,7 @@ import torch
 from mipmap_plugin.backends import get_backend, note_of, survey
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.conformance import CASES, MORE, Outcome, check_backend
-from mipmap_plugin.errors import BackendUnavailable
+from mipmap_plugin.errors import BackendUnavailable, plural
 from mipmap_plugin.evaluation.report import markdown
 from mipmap_plugin.process import threads
 from mipmap_plugin.progress import Bar
@@ -68,6 +68,6 @@ def check_table(rows: Sequence[Outcome]) -> str:
     ran = sorted((row for row in rows if not row.skipped), key=lambda row: not row.passed)
     body = [[row.case, f"{row.max_error:.1e}", "yes" if row.finite else "NO", "pass" if row.passed else f"FAIL: {row.message}"] for row in ran]
     reasons = Counter(reason for row in rows if row.skipped for reason in row.message.split("; "))
-    skipped = [f"skipped, {count} times: {reason}" for reason, count in reasons.most_common(REASONS)]
-    skipped += [f"skipped for {len(reasons) - REASONS} more reasons (--json has all)"] * (len(reasons) > REASONS)
+    skipped = [f"skipped, {plural(count, 'time')}: {reason}" for reason, count in reasons.most_common(REASONS)]
+    skipped += [f"skipped for {plural(len(reasons) - REASONS, 'more reason')} (--json has all)"] * (len(reasons) > REASONS)
     return "\n".join([*skipped, markdown(["case", "max error", "finite", "result"], body)])

@@ -15,7 +15,6 @@ from mipmap_plugin.adaptation.report import versions
 from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import CheckpointError
-from mipmap_plugin.formats.atomic import delete
 from mipmap_plugin.formats.torch_file import load_torch, save_torch
 
 
@@ -41,11 +40,6 @@ class Cells:
         except CheckpointError:  # cut off by a crash of the machine
             return None
         return content
-
-    def remove(self) -> None:
-        """Delete the folder, when everything is written elsewhere."""
-        if self.folder is not None:
-            delete(self.folder)
 
     def keep(self, key: Mapping[str, Any], content: dict[str, Any]) -> None:
         """Write a finished cell, of tensors and plain values, atomically. Raises OutputError."""

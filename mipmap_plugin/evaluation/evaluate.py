@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -15,7 +14,7 @@ import torch
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.errors import SettingsError, unknown
+from mipmap_plugin.errors import SettingsError, some_of, unknown, warn
 from mipmap_plugin.evaluation.cells import Cells, made_by
 from mipmap_plugin.evaluation.measure import (
     FILTERS,
@@ -164,7 +163,7 @@ def evaluator_of(model: Wrapped, scene: Scene, protocol: str, perceptual: Percep
         raise SettingsError(unknown("protocol", str(protocol), names))
     scene = model.place(scene)
     if doubt := of_another_size(model, scene):
-        warnings.warn(doubt, stacklevel=2)
+        warn(doubt)
     views, notes = photographed_views(model, scene), [*scene.notes, *not_held_out(model, scene)]
     return Evaluator(views, PROTOCOLS[protocol], perceptual, scene.source.name, cells=cells or Cells(), notes=notes)
 
@@ -183,7 +182,7 @@ def all_rows(model: Wrapped, judge: Evaluator, scales: Sequence[float], recipes:
         config_of(name, scale, settings)
     model.refuse_undrawn([view.camera for view in judge.views], min(scales))
     if doubt := of_another_scene(model, judge.views, scales[0], judge.protocol):
-        warnings.warn(doubt, stacklevel=2)
+        warn(doubt)
     for scale in scales:
         rows += training_free_rows(model, judge, scale, settings.get("upsampler", "bicubic"), viewer=viewer)
         rows += _adapted_rows(model, judge, scale, recipes, settings) if scale != 1 or viewer else []
@@ -224,7 +223,7 @@ def _views(config: AdaptConfig, on: str, judged: Sequence[TruthView]) -> dict[st
 def _unseen(judged: Sequence[TruthView], adapted: Adapted) -> str:
     """The part of a row's name that says whether the model was adapted to any of the evaluated views."""
     seen = len(views_seen([view.camera for view in judged], adapted.adapted_to))
-    return f"{seen} of {len(judged)} judged views adapted to" if seen else "held out"
+    return f"{some_of(seen, len(judged), 'judged view')} adapted to" if seen else "held out"
 
 
 def means(rows: Sequence[Row]) -> list[Row]:

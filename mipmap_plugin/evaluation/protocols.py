@@ -23,7 +23,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.target.photographs import at_density_of
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, plural, some_of
 from mipmap_plugin.evaluation.measure import views_seen
 from mipmap_plugin.evaluation.photographs import kept_photographs
 from mipmap_plugin.formats.images import averaged_straight, has_alpha, image_size, pillow_bicubic, read_image, read_straight
@@ -170,18 +170,19 @@ def not_held_out(model: Wrapped, scene: Scene) -> list[str]:
     views, judged, options = len(_photographed(scene)), _judged(scene, model.cameras), read_options(model.model.folder)[0]
     seen = len(views_seen(judged, _split(model.cameras, "train")))
     if not _split(judged, "test"):
-        unmarked = f"{scene.source.name}: no photograph is marked as for testing, so of {views} photographs"
+        unmarked = f"{scene.source.name}: no photograph is marked as for testing, so of {plural(views, 'photograph')}"
         if len(judged) < views:
             return [f"{unmarked} those are taken that the checkpoint holds out: {len(judged)}"]
-        trained = f"all are taken: {seen} have poses that the checkpoint counts as its training's"
+        trained = f"all are taken: {seen} {'has a pose' if seen == 1 else 'have poses'} that the checkpoint counts as its training's"
         return [f"{unmarked} {trained}, and the dB of every row, the base's included, are higher than on other views"] if seen else []
+    of_them = some_of(seen, len(judged), "photographed test view")
     if seen and options.get("eval") and options.get("train_test_exp"):
-        return [f"cfg_args says --train_test_exp: the checkpoint was trained on half of each of {seen} of {len(judged)} photographed test views"]
+        return [f"cfg_args says --train_test_exp: the checkpoint was trained on half of each of {of_them}"]
     if seen and options.get("eval") is False:
-        trained = f"the checkpoint was trained on {seen} of {len(judged)} photographed test views"
+        trained = f"the checkpoint was trained on {of_them}"
         return [f"cfg_args says no --eval: {trained}, so that no row, the base's included, is held out from its training"]
     if seen and options.get("eval") and not options.get("lod"):  # whose test views are others
-        return [f"{seen} of {len(judged)} photographed test views of {scene.source.name} are no test views of the checkpoint: it was trained on them"]
+        return [f"the checkpoint was trained on {of_them} of {scene.source.name}, whose test views are not its own"]
     return []
 
 

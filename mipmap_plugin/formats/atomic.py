@@ -10,7 +10,7 @@ import math
 import os
 import shutil
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextvars import ContextVar
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -27,32 +27,35 @@ _open: ContextVar[Staging | None] = ContextVar("_open", default=None)
 
 
 @contextlib.contextmanager
-def together(path: Path) -> Iterator[None]:
+def together(path: Path, spent: Iterable[Path] = ()) -> Iterator[None]:
     """Make everything that the block writes to, into or beside `path` one atomic output: it appears if the block succeeds.
 
-    A process that is killed while several files are moved into place leaves a record, from which the next run that writes to `path` or
-    loads it completes the move (`staging`). Raises OutputError.
+    `spent`: files and folders, such as the state of the run, that are removed with that, and else stay. A process that is killed while several
+    files are moved into place leaves a record, from which the next run that writes to `path` or loads it completes all this (`staging`).
+    Raises OutputError.
     """
     with _as_output_error(path):
         place, holding = absolute(path), _open.get()
         if holding is not None and holding.inside(place) is not None:
             yield
+            holding.spent += map(absolute, spent)
             return
         missing = missing_folders(place.parent)
         try:
             place.parent.mkdir(parents=True, exist_ok=True)
-            with _staged(place):
+            with _staged(place, [*map(absolute, spent)]):
                 yield
         finally:
             remove_empty(missing)
 
 
 @contextlib.contextmanager
-def _staged(place: Path) -> Iterator[None]:
+def _staged(place: Path, spent: Sequence[Path]) -> Iterator[None]:
     staging = Staging(place)
     token = _open.set(staging)
     try:
         yield
+        staging.spent += spent
         staging.commit()
     except MipmapPluginError as error:  # which may name the hidden place
         error.args = tuple(str(each).replace(str(staging.new), str(staging.place)) for each in error.args)
@@ -139,7 +142,7 @@ def refuse_output(path: Path, overwrite: bool, base: Iterable[Path] = (), *, is_
     if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
         raise OutputExists(f"{path} is {kind_of_node(status)}, which is never replaced; choose another path")
     if any(os.path.samestat(status, each) for file in base for each in _around(file, stat.S_ISDIR(status.st_mode))):
-        reason = "holds the base checkpoint itself" if stat.S_ISDIR(status.st_mode) else "is the base checkpoint itself, or a part of it"
+        reason = "holds the base checkpoint itself" if stat.S_ISDIR(status.st_mode) else "is the base checkpoint itself, or read with it"
         raise OutputExists(f"{path} {reason}, which is never replaced; choose another path")
     if is_file and stat.S_ISDIR(status.st_mode):
         raise OutputExists(f"{path} is a folder, which no file replaces; choose the path of a file")
@@ -173,11 +176,11 @@ def settled(path: Path) -> Path:
     return path
 
 
-def delete(folder: Path, output: Path | None = None) -> None:
+def delete(folder: Path) -> None:
     """Delete a folder of unfinished work, as far as the system lets this run. It is moved away before, in one step: a part of it, which a killed run
-    leaves, would be in the way of others. Whoever asks for `output`, by default the folder, next removes what is left (`settled`)."""
+    leaves, would be in the way of others. Whoever asks for the folder next removes what is left (`settled`)."""
     with contextlib.suppress(OSError):
-        staging = Staging(absolute(output or folder))
+        staging = Staging(absolute(folder))
         try:
             os.rename(folder, staging.new / folder.name)
         finally:
@@ -246,12 +249,15 @@ def sha256(*paths: Path) -> str:
     return digest.hexdigest()
 
 
-def refuse_to_lose(target: Path, source: Path | None, holds: str, ours: Iterable[str]) -> None:
+def refuse_to_lose(target: Path, source: Path | None, holds: str, ours: Sequence[str]) -> None:
     """Raise OutputExists if the folder `target` holds the base checkpoint, is of another kind, or has other things in it.
 
     Replacing a folder deletes its contents. `holds`: what a folder of this kind has. `ours`: patterns (fnmatch) of its files' paths in it.
     """
     place = absolute(target)
+    with _as_output_error(target):
+        for name in {pattern.partition("/")[0] for pattern in ours}:  # written into it by a run that was killed
+            settle(place / name)
     if source is not None and place.is_dir() and any(os.path.samestat(place.stat(), each) for each in _around(source / "x", folders=True)):
         raise OutputExists(f"{target} holds the base checkpoint itself, which --overwrite would delete; choose another folder")
     if place.is_dir() and any(place.iterdir()) and not (place / holds).exists():

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, warn
 
 # Viewers that read a .glb as it is written here, and names for whatever draws as 3DGS does: three.js by an extension of its loader, Babylon.js by the
 # package of its loaders.
@@ -65,12 +64,12 @@ def refuse_unread(path: Path, viewers: Sequence[str]) -> None:
     """
     unread, partly = ({viewer: told[viewer] for viewer in viewers if viewer in told} for told in (_told(path, UNREAD), _told(path, PARTLY)))
     if viewers and not unread and set(viewers) <= TILES_ONLY.keys():
-        warnings.warn(f"{path}: {TILES_ONLY[viewers[0]]}", stacklevel=3)
+        warn(f"{path}: {TILES_ONLY[viewers[0]]}")
     elif reasons := "; ".join(dict.fromkeys([*unread.values(), *partly.values()])):
         advice = f"{path}: {reasons}" + ("" if set(viewers) <= TILES_ONLY.keys() else "; give a .ply by --output")
         if len(unread) == len(viewers):
             raise SettingsError(advice)
-        warnings.warn(f"{advice} if it is for these too", stacklevel=3)
+        warn(f"{advice} if it is for these too")
 
 
 def _told(path: Path, by_ending: Mapping[str, dict[str, str]]) -> dict[str, str]:

@@ -3,6 +3,7 @@
 `.NAME.<slot>.tmp` contains `new` while an output is being written; `new` is discarded if its run is killed. A single file is moved into
 place by one rename, and a folder is exchanged with the old one, both atomically. If several steps are needed (a file and its companions,
 or a system that cannot exchange folders), `new` is first renamed to `ready`: from then on it is complete, and the next run finishes the moves.
+`spent` names what the output was made from, such as the state of its run, which is removed when the output is in its place, and not before.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ class Staging:
         settle(path)
         self._folder, self._lock = _free_slot(path)
         self.new = self._folder / "new"
+        self.spent = list[Path]()  # absolute paths, to be removed once the output is in its place
         try:
             self.new.mkdir()
         except BaseException:  # of a full disk, or Ctrl-C
@@ -55,17 +57,22 @@ class Staging:
         return made if path.parent == self.place or (folder in made.parents and folder.is_dir()) else None
 
     def commit(self) -> None:
-        """Move what was written to `new` to its place. Raises OSError."""
+        """Move what was written to `new` to its place, and remove what is spent with it. Raises OSError."""
         made = list(self.new.iterdir())
-        if len(made) == 1 and _moved_at_once(made[0], self.place / made[0].name):
-            return
-        ready = self._folder / "ready"
-        os.rename(self.new, ready)
-        try:
-            _move_in(self._folder)
-        except OSError:
-            shutil.rmtree(ready, ignore_errors=True)
-            raise
+        kept = {self.place / each.name for each in made} | {*self.path.parents}
+        spent = [path for path in self.spent if os.path.lexists(path) and path not in kept]
+        if self.new / self.path.name in made:
+            _note_spent(self._folder, [path for path in spent if path.parent == self.place])
+        if not (len(made) == 1 and _moved_at_once(made[0], self.place / made[0].name)):
+            ready = self._folder / "ready"
+            os.rename(self.new, ready)
+            try:
+                _move_in(self._folder)
+            except OSError:
+                shutil.rmtree(ready, ignore_errors=True)
+                raise
+        for path in spent:
+            _remove(path, self._folder)
 
     def close(self) -> None:
         """Take the hidden folder away. Moves that Ctrl-C broke off are finished first."""
@@ -92,15 +99,16 @@ def claim(folder: Path) -> int | None:
         if not _locked(lock, made):
             os.close(lock)
             return None
-        if os.path.lexists(folder) and os.path.samestat(os.fstat(lock), os.stat(folder)):
+        if _is_of(lock, folder):
             return lock
         os.close(lock)
 
 
 def release(folder: Path, lock: int) -> None:
-    """Give back what `claim` took, and remove it."""
+    """Give back what `claim` took, and remove it, if it is still there."""
     try:
-        shutil.rmtree(folder, ignore_errors=True)
+        if lock < 0 or _is_of(lock, folder):
+            shutil.rmtree(folder, ignore_errors=True)
     finally:
         if lock >= 0:
             os.close(lock)
@@ -163,6 +171,11 @@ def _locked(lock: int, made: bool) -> bool:
     return True
 
 
+def _is_of(lock: int, folder: Path) -> bool:
+    """Whether the folder is the one of this descriptor, and not another one that has got its name since."""
+    return os.path.lexists(folder) and os.path.samestat(os.fstat(lock), os.stat(folder))
+
+
 def _is_stale(folder: os.stat_result) -> bool:
     return time.time() - folder.st_mtime > STALE_S
 
@@ -180,8 +193,7 @@ def _moved_at_once(made: Path, target: Path) -> bool:
 
 def _move_in(folder: Path) -> None:
     """Move what is ready into place: companions first, the output itself last. Raises OSError after restoring the old one."""
-    main = folder.name[1:].rsplit(".", 2)[0]
-    for made in sorted((folder / "ready").iterdir(), key=lambda entry: entry.name == main):
+    for made in sorted((folder / "ready").iterdir(), key=lambda entry: entry.name == _output_of(folder).name):
         target, aside = folder.parent / made.name, folder / "old"
         if not made.is_dir():
             os.replace(made, target)
@@ -195,7 +207,41 @@ def _move_in(folder: Path) -> None:
             raise
 
 
+def _output_of(folder: Path) -> Path:
+    return folder.with_name(folder.name[1:].rsplit(".", 2)[0])
+
+
+def _note_spent(folder: Path, spent: Iterable[Path]) -> None:
+    """Note what is spent once the output is the file or folder that is `new` now: by inodes, as both names may be those of others after a kill."""
+    for path in spent:
+        (folder / "spent" / _inode(folder / "new" / _output_of(folder).name) / _inode(path) / path.name).mkdir(parents=True)
+
+
+def _remove_spent(folder: Path) -> None:
+    """Remove what a killed run had no time to, if its output is in its place."""
+    for noted in (folder / "spent" / _inode(_output_of(folder))).glob("*/*"):
+        if _inode(path := folder.with_name(noted.name)) == noted.parent.name:
+            _remove(path, folder)
+
+
+def _inode(path: Path) -> str:
+    try:
+        return str(path.lstat().st_ino)
+    except OSError:
+        return "missing"
+
+
+def _remove(path: Path, folder: Path) -> None:
+    """Remove a file or a folder with the hidden `folder`, into which it moves in one step: a part of it would be in the way of others."""
+    try:
+        (folder / "removed").mkdir(exist_ok=True)
+        os.rename(path, folder / "removed" / path.name)
+    except OSError:  # on another disk
+        path.unlink(missing_ok=True) if not path.is_dir() or path.is_symlink() else shutil.rmtree(path, ignore_errors=True)
+
+
 def _finish(folder: Path, lock: int) -> None:
     if (folder / "ready").is_dir():
         _move_in(folder)
+    _remove_spent(folder)
     release(folder, lock)

@@ -95,15 +95,13 @@ def unpack(delivery: Delivery, job: Job) -> Outcome:
     base, within = job.base.checkpoint, outcome.file.parts[1:]  # of a model folder
     source, model_folder = (None, base) if base.is_dir() else (base, None)
     refuse_parts(job.target, job.overwrite, source, model_folder, within[0] if within else None)
-    with together(job.target), tarfile.open(fileobj=io.BytesIO(delivery.files)) as archive:
+    with together(job.target, _states(job.target)), tarfile.open(fileobj=io.BytesIO(delivery.files)) as archive:
         if within:
             with new_folder(job.target, job.overwrite) as folder:
                 archive.extractall(folder.parent, filter="data")
         else:
             for member in archive.getmembers():
                 _write(archive, member, place, job, parts_of(source, model_folder))
-    for state in _states(job.target):
-        state.unlink(missing_ok=True)
     return replace(outcome, file=place / outcome.file)
 
 

@@ -18,6 +18,7 @@ from contextlib import contextmanager, redirect_stderr
 from dataclasses import replace
 from typing import IO
 
+from mipmap_plugin.errors import MipmapPluginWarning
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.process.freed_memory import keep_freed_memory
 from mipmap_plugin.process.signals import INTERRUPTED, Ending, ends_as_by_ctrl_c
@@ -66,6 +67,7 @@ def _run_quietly(job: Job, threads: int | None) -> Outcome:
     with redirect_stderr(io.StringIO()), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore")
         warnings.filterwarnings("default", module=r"mipmap_plugin(\.|$)")
+        warnings.filterwarnings("default", category=MipmapPluginWarning)
         try:
             from mipmap_plugin.jobs.run import run  # not interruptible: what it loads, torch among it, may swallow a KeyboardInterrupt
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
+from mipmap_plugin.errors import warn
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL
 from mipmap_plugin.models import load_model
@@ -17,7 +17,7 @@ def readable(ply: Path, copy: Path) -> Path:
     bands = (MOST_BANDS + 1) ** 2 - 1
     if sum(name.startswith("f_rest_") for name in read_header(ply).vertex.names) <= 3 * bands:
         return ply
-    warnings.warn(LOST, stacklevel=2)
+    warn(LOST)
     model = load_model(ply).copy()
     parameters = {name: tensor.detach() for name, tensor in model.parameters().items()}
     model.replace_parameters(parameters | {"shN": parameters["shN"][:, :bands].contiguous()})

@@ -9,6 +9,7 @@ from typing import Any
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.errors import plural
+from mipmap_plugin.formats.atomic import delete, together
 from mipmap_plugin.levels.contents import Contents, Level
 from mipmap_plugin.levels.distance.manifest import Contents as DistanceContents
 from mipmap_plugin.levels.store import LevelStore
@@ -38,10 +39,14 @@ class Ladder:
 
         `keep_resume`: leave what was kept to go on from until `forget`.
         """
-        saved = self._write(self.contents, path_of(folder), overwrite)
-        self._store.note(saved) if keep_resume else self.forget()
+        folder = path_of(folder)
+        with together(folder, [] if keep_resume else self._store.folders()):
+            saved = self._write(self.contents, folder, overwrite)
+            if keep_resume:
+                self._store.note(saved)
         return saved
 
     def forget(self) -> None:
         """Delete what was kept to go on from."""
-        self._store.remove()
+        for folder in self._store.folders():
+            delete(folder)

@@ -14,7 +14,7 @@ from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.report import Report, versions
 from mipmap_plugin.camera import digest_of
 from mipmap_plugin.errors import MipmapPluginError, SettingsError, brief
-from mipmap_plugin.formats.atomic import delete, json_text, refuse_unwritable, settled, sha256, write_json
+from mipmap_plugin.formats.atomic import json_text, refuse_unwritable, settled, sha256, staged, write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.request import LadderRequest
@@ -72,14 +72,13 @@ class LevelStore:
             return self._loaded(file)
 
     def note(self, written: Path) -> None:
-        """Keep which ladder was `written` of the levels, so that the same command may replace it (`is_of`)."""
+        """Keep which ladder is `written` of the levels, so that the same command may replace it (`is_of`)."""
         if self._folder is not None:
-            write_json(self._folder / OUTCOME, {MANIFEST: sha256(written / MANIFEST)}, overwrite=True)
+            write_json(self._folder / OUTCOME, {MANIFEST: sha256(staged(written / MANIFEST))}, overwrite=True)
 
-    def remove(self) -> None:
-        """Delete the folder, whose levels have been saved elsewhere."""
-        if self._folder is not None:
-            delete(self._folder)
+    def folders(self) -> list[Path]:
+        """The folder, if there is one."""
+        return [] if self._folder is None else [self._folder]
 
     def _loaded(self, file: Path) -> Adapted:
         """A level as it is in its file. Every level is read, also one just made, so that a ladder is the same whether it was interrupted or not."""

@@ -12,7 +12,6 @@ cameras that look at the scene from all around.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mipmap_plugin.errors import TEMPORARY, SettingsError
+from mipmap_plugin.errors import TEMPORARY, SettingsError, warn
 from mipmap_plugin.formats.atomic import new_folder, write_json
 from mipmap_plugin.formats.splat_transform import LOD_META
 from mipmap_plugin.formats.streamed_sog import Chunk, read_chunks, write_streamed_sog
@@ -144,7 +143,7 @@ def write_streamed(folder: Path, canvas: int = CANVAS) -> Path:
     if not rising:
         raise SettingsError(f"{folder}: {SINGLE_LEVEL}; open its level as it is")
     if rising[0] < NEAREST:
-        warnings.warn(TOO_SMALL.format(least=NEAREST, first=rising[0]), stacklevel=2)
+        warn(TOO_SMALL.format(least=NEAREST, first=rising[0]))
     with new_folder(folder / STREAMED, overwrite=False) as temporary, TemporaryDirectory(prefix=TEMPORARY) as copies:
         made = temporary / LOD_META
         extent = manifest.get("chunk_extent", max(1, round(EXTENT * rising[0])))

@@ -13,7 +13,6 @@ from __future__ import annotations
 import gzip
 import shutil
 import struct
-import warnings
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
@@ -24,7 +23,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import ONE_PIXEL
-from mipmap_plugin.errors import TEMPORARY
+from mipmap_plugin.errors import TEMPORARY, warn
 from mipmap_plugin.formats.atomic import new_folder, write_json
 from mipmap_plugin.formats.glb import FLOAT, before_binary
 from mipmap_plugin.formats.gltf import SPLATTING, SPZ_INSIDE
@@ -95,7 +94,7 @@ def write_tile(ply: Path, tile: Path) -> None:
     compressed, parameters = tile.with_suffix(".spz"), load_model(ply).parameters()
     means = parameters["means"].detach()
     if lost := cut_off(compressed, parameters):
-        warnings.warn(f"{tile.name}: {lost}", stacklevel=2)
+        warn(f"{tile.name}: {lost}")
     refuse_far(tile, parameters, "open the level itself")
     with TemporaryDirectory(prefix=TEMPORARY) as folder:
         write_exchange(compressed, partial(shutil.copyfile, readable(ply, Path(folder, ply.name))), overwrite=False)

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mipmap_plugin.errors import CheckpointError, PluginError, type_of
+from mipmap_plugin.errors import CheckpointError, PluginError, plural, type_of
 from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import OF_SPLATS, Family, Files, Match
-from mipmap_plugin.models.places import PARTS, REPORT
+from mipmap_plugin.models.places import PARTS, REPORT, has_report
 from mipmap_plugin.models.zipped_folder import opened, retold, told
 
 # Suffixes of files of splats besides PLY, and of photographs.
@@ -54,7 +54,7 @@ def detect(path: str | Path, *, iteration: int | None = None) -> Checkpoint:
     In a folder, the newest `iteration_<N>` whose PLY is complete is used, or `iteration`.
     Raises CheckpointError for a path that is missing, damaged, or not a checkpoint.
     """
-    if path == "":
+    if isinstance(path, str) and not path:
         raise CheckpointError("no path was given; give a PLY file or a model folder")
     path = settled(path_of(path))
     if path.is_dir():
@@ -127,7 +127,7 @@ def _most_certain(files: Files, claims: dict[str, tuple[Family, Match]], notes: 
 
 def _why_not(files: Files) -> str:
     path, kind = files.path, files.kind
-    if path.suffix.lower() not in OWN_SUFFIXES and path.with_name(path.name + REPORT).is_file():
+    if path.suffix.lower() not in OWN_SUFFIXES and has_report(path):
         remedy = "install the package that adds that family (`mipmap-plugin list families` shows which are found), or give the file its ending again"
         return f"{path} was adapted from a checkpoint of a family that is not installed here, or knows its files by another ending; {remedy}"
     if files.header:
@@ -168,7 +168,7 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
     files = sorted(folder.iterdir())
     clouds = [file for file in files if file.suffix.lower() == ".ply"]
     clouds = clouds or [file for file in files if file.suffix.lower() in EXCHANGED and file.is_file()]
-    clouds = [cloud for cloud in clouds if not cloud.with_name(cloud.name + REPORT).exists()] or clouds  # no adaptations, where there is a base
+    clouds = [cloud for cloud in clouds if not has_report(cloud)] or clouds  # no adaptations, where there is a base
     if len(clouds) > 1 and folder / "point_cloud.ply" in clouds:
         clouds = [folder / "point_cloud.ply"]
     if len(clouds) == 1:
@@ -179,7 +179,7 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
     if not clouds and (below := _below(folder)):
         more = ", ..." if len(below) > NAMED else ""
         raise CheckpointError(f"{folder} lies above its checkpoint{'s' * (len(below) > 1)}; give {' or '.join(map(str, below[:NAMED]))}{more}")
-    content = f"{len(clouds)} files of splats ({some})" if clouds else f"no point_cloud folder and no file of splats{_instead(folder)}"
+    content = f"{plural(len(clouds), 'file')} of splats ({some})" if clouds else f"no point_cloud folder and no file of splats{_instead(folder)}"
     raise CheckpointError(f"{folder} holds {content}; give one file, or a model folder with point_cloud/iteration_<N>")
 
 

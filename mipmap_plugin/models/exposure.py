@@ -19,7 +19,7 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import EXPOSURE, Effect
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, some_of
 
 FILE = "exposure.json"
 
@@ -63,7 +63,7 @@ class Exposures:
             return self.why_none
         if not self.changed:
             return f"{FILE} holds only identities: no exposure was trained"
-        return f"{FILE} changes {self.changed} of {len(self.matrices)} images"
+        return f"{FILE} changes {some_of(self.changed, len(self.matrices), 'image')}"
 
 
 NO_EXPOSURES = Exposures()

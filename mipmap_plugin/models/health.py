@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.errors import CheckpointError, some_of, warn
 from mipmap_plugin.models.base import OF_3DGS, SplatModel
 
 # Below one 8-bit step no 3DGS rasterizer draws a splat (diff-gaussian-rasterization, forward.cu).
@@ -79,14 +78,14 @@ class Health:
         """Remarks for the user; empty for a healthy checkpoint."""
         counts = [
             (int(self.invalid.sum()), f"are not finite once activated, or above {LARGEST:g}, and would spoil images"),
-            (self.zero_quaternions, "have a zero quaternion and are drawn unrotated"),
+            (self.zero_quaternions, "have a zero quaternion: drawn unrotated"),
             (self.huge, f"are longer than the scene ({units(self.extent, 3)} units)"),
             (self.tiny, f"have an axis below {TINY_SHARE:g} of the scene: sheets or needles"),
             (self.sizeless, "have no size: drawn as a dot where splats are dilated without compensation, and nowhere else"),
-            (self.invisible, "have an opacity below 1/255 and are never drawn"),
+            (self.invisible, "have an opacity below 1/255: never drawn"),
             (self.splats * self.faint, "have an opacity below 2 %, as right after training resets them; give a later checkpoint if it is faint"),
         ]
-        remarks = [f"{count:,} of {self.splats:,} splats {what}" for count, what in counts if count]
+        remarks = [some_of(count, self.splats, "splat", what) for count, what in counts if count]
         return [*_non_finite(self.splats, self.nan, self.infinite), *remarks, *self.doubts()]
 
     def spoilt(self) -> bool:
@@ -107,7 +106,7 @@ class Health:
 def doubts(splats: int, rounded: int, step: float, linear: bool, activated: bool) -> list[str]:
     """`Health.doubts`, of what it counts."""
     why = f"lie {ROUNDED} to steps of {step:.2g} units, which is much for their size"
-    lost = f"{rounded:,} of {splats:,} splats {why}; export the scene again, moved near the origin together with its cameras"
+    lost = f"{some_of(rounded, splats, 'splat', why)}; export the scene again, moved near the origin together with its cameras"
     found = {lost: rounded > COARSE_SHARE * splats, LINEAR: linear, ACTIVATED: activated}
     return [sentence for sentence, doubtful in found.items() if doubtful]
 
@@ -115,7 +114,8 @@ def doubts(splats: int, rounded: int, step: float, linear: bool, activated: bool
 def _non_finite(splats: int, nan: Mapping[str, int], infinite: Mapping[str, int]) -> list[str]:
     """The sentences on NaN and infinity: so many of the `splats`, by parameter."""
     found = {"a NaN": nan, "an infinity": infinite}
-    return [f"{count:,} of {splats:,} splats hold {kind} in {name}" for kind, by_name in found.items() for name, count in by_name.items() if count]
+    counts = [(kind, name, count) for kind, by_name in found.items() for name, count in by_name.items() if count]
+    return [some_of(count, splats, "splat", f"hold {kind} in {name}") for kind, name, count in counts]
 
 
 def units(length: float, digits: int) -> str:
@@ -166,7 +166,7 @@ def why_invalid(model: SplatModel, invalid: Tensor) -> list[str]:
     infinite = {name: _each_row(tensor == math.inf if name == "scales" else tensor.isinf()) for name, tensor in rows.items() if name != "opacities"}
     told = torch.stack([*nan.values(), *infinite.values()]).any(0)
     sentences = _non_finite(len(invalid), *({name: _rows(each) for name, each in found.items()} for found in (nan, infinite)))
-    return sentences + ([f"{n:,} of {len(invalid):,} splats are above {LARGEST:g} once activated"] if (n := _rows(~told)) else [])
+    return sentences + ([some_of(n, len(invalid), "splat", f"are above {LARGEST:g} once activated")] if (n := _rows(~told)) else [])
 
 
 def refuse_few(invalid: Tensor, source: Path | str | None) -> None:
@@ -174,7 +174,7 @@ def refuse_few(invalid: Tensor, source: Path | str | None) -> None:
     count, lost = len(invalid), int(invalid.sum())
     if count and lost >= MOST_DROPPED * count:
         left = count - lost
-        few = f"none of its {count:,} splats is" if left == 0 else f"only {left:,} of its {count:,} splats are"
+        few = "only " * bool(left) + some_of(left, count, "splat", "are")
         order = "its header may name the wrong byte order, or " if str(source).lower().endswith(".ply") else ""
         why = f"{order}the training or the export failed; export it again"
         raise CheckpointError(f"{source or 'this model'}: {few} finite once activated, and below {LARGEST:g}; {why}")
@@ -185,11 +185,10 @@ def doubts_in(notes: Iterable[str]) -> list[str]:
     return [note for note in notes if note in (LINEAR, ACTIVATED) or DROPPED in note or ROUNDED in note]
 
 
-def dropped(mask: Tensor, rows: str, why: str, source: Path | str | None) -> str:
-    """The note that the `rows` where `mask` [N] is True are left out, which is also a warning: what is drawn is not all of the file."""
-    count = int(mask.sum())
-    note = f"{count:,} of {len(mask):,} {rows} {'was' if count == 1 else 'were'} {DROPPED}: {why}"
-    warnings.warn(f"{source or 'this model'}: {note}", stacklevel=2)
+def dropped(mask: Tensor, row: str, why: str, source: Path | str | None) -> str:
+    """The note that each `row` where `mask` [N] is True is left out, which is also a warning: what is drawn is not all of the file."""
+    note = f"{some_of(int(mask.sum()), len(mask), row, 'were')} {DROPPED}: {why}"
+    warn(f"{source or 'this model'}: {note}")
     return note
 
 

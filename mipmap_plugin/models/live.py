@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mipmap_plugin.errors import SettingsError, ShapeError, type_of
+from mipmap_plugin.errors import SettingsError, ShapeError, some_of, type_of
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import splatfacto
 from mipmap_plugin.models.anchors.companions import NEEDED
@@ -147,7 +147,7 @@ def _checked(model: SplatModel) -> SplatModel:
         return without_invalid(model)
     for name, tensor in model.parameters().items():
         if rows := rows_where(torch.isnan, tensor.detach()):
-            raise SettingsError(f"this {_name(model)} holds a NaN in {name} of {rows:,} of its {len(tensor):,} rows; drop these first")
+            raise SettingsError(f"this {_name(model)} holds a NaN in {name} of {some_of(rows, len(tensor), 'row')}; drop these first")
     return model
 
 

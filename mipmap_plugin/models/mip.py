@@ -18,7 +18,7 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import NEAR_PLANE, Effect
-from mipmap_plugin.errors import CheckpointError, ShapeError
+from mipmap_plugin.errors import CheckpointError, ShapeError, plural, some_of
 from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import CARRIED, SplatModel, TrainedScale, Traits
@@ -73,7 +73,7 @@ class MipModel:
 
     @property
     def traits(self) -> Traits:
-        on, reason = self._smooths, f"the file gives one for each of {len(self):,} splats"
+        on, reason = self._smooths, f"the file gives one for each of {plural(len(self), 'splat')}"
         if not on:
             reason = "the file gives one, but its project does not apply it"
         elif not self.filter_3d.any():
@@ -158,7 +158,7 @@ def load_mip(path: str | Path, *, iteration: int | None = None) -> MipModel:
     splats = read_splats(checkpoint, VanillaModel)
     invalid = torch.from_numpy(~((splats.extras[COLUMN] >= 0) & (splats.extras[COLUMN] <= LARGEST)))
     if invalid.all():
-        raise CheckpointError(f"{checkpoint.path}: none of its {len(splats):,} splats has a valid {COLUMN}; export it again")
+        raise CheckpointError(f"{checkpoint.path}: {some_of(0, len(splats), 'splat', 'have')} a valid {COLUMN}; export it again")
     if invalid.any():
         splats = drop(splats, invalid, f"an invalid {COLUMN}", checkpoint.path)
     filter_3d = torch.from_numpy(splats.extras[COLUMN]).float()

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from mipmap_plugin.errors import OutputExists, SettingsError
+from mipmap_plugin.errors import OutputExists, SettingsError, plural, some_of
 from mipmap_plugin.formats.atomic import absolute, named, refuse_output, refuse_to_lose
 from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.formats.ply import read_header
@@ -20,7 +20,7 @@ from mipmap_plugin.formats.spz import fraction_for
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.health import COARSE_SHARE, COARSE_STEP, rows_where
-from mipmap_plugin.models.places import CONVERTED, PARTS, REPORT, STATE
+from mipmap_plugin.models.places import CONVERTED, PARTS, REPORT, STATE, has_report
 
 # What is written into a model folder, of all families.
 WRITTEN = (
@@ -94,7 +94,7 @@ def refuse_far(path: Path, parameters: Mapping[str, Tensor], instead: str) -> No
     step = 2.0**-fraction
     coarse = int((step > COARSE_STEP * sizes).sum())
     if fraction < 0 or coarse > COARSE_SHARE * len(sizes):
-        rounded = f"would round positions to {step:g} unit, more than half the size of {coarse:,} of {len(sizes):,} splats"
+        rounded = f"would round positions to {step:g} unit, more than half the size of {some_of(coarse, len(sizes), 'splat')}"
         where = f"a splat lies {farthest:,.0f} units from the origin along an axis, for which SPZ {'has no room' if fraction < 0 else rounded}"
         raise SettingsError(f"{path}: {where}; remove what lies far away, move or shrink the scene, or {instead}")
 
@@ -126,7 +126,7 @@ def cut_off(path: Path, parameters: Mapping[str, Tensor]) -> str:
         "with other harmonics outside -1 to 1": (harmonics > SPZ_HARMONICS).any(dim=1),
     }
     found = ", ".join(f"{int(where.sum()):,} {what}" for what, where in beyond.items() if where.any())
-    return f"SPZ cuts off, of {len(longest):,} splats, {found}; a .ply keeps them" if found else ""
+    return f"SPZ cuts off, of {plural(len(longest), 'splat')}, {found}; a .ply keeps them" if found else ""
 
 
 def drawn_otherwise(path: Path, trained: TrainedScale) -> str:
@@ -153,7 +153,7 @@ def finite(parameters: Mapping[str, Tensor], most: float) -> dict[str, Tensor]:
     for name, value in {**cleaned, "lengths": cleaned["scales"].exp()}.items():
         if rows := rows_where(partial(_is_wrong, most=torch.inf if name in ("opacities", "quats") else most), value):
             raise SettingsError(
-                f"{rows:,} of {len(value):,} rows hold a NaN, an infinity or more than {most:g} in {name}, so nothing is saved;"
+                f"{some_of(rows, len(value), 'row', 'hold')} a NaN, an infinity or more than {most:g} in {name}, so nothing is saved;"
                 " adapt less boldly, or to another scale"
             )
     return cleaned
@@ -173,4 +173,4 @@ def _belongs(name: str, source: str) -> bool:
 def is_adapted(file: Path) -> bool:
     """Whether a file is the output of an adaptation, its report or the state of its run. Raises OutputError for a root."""
     file = named(file)
-    return file.name.endswith((REPORT, STATE, STATE + CONVERTED)) or file.with_name(file.name + REPORT).exists()
+    return file.name.endswith((REPORT, STATE, STATE + CONVERTED)) or has_report(file)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -22,6 +23,12 @@ STATE, CONVERTED = ".resume", ".x1"
 
 # The same for the page that shows what came out, and for the folder of unfinished tiles, with what says in it what they belong to.
 PAGE_ENDING, TILES, PLAN = ".report.html", ".tiles", "plan.json"
+
+# The page in the folder of a ladder or of a tradeoff.
+PAGE = "report.html"
+
+# How a page says that it is one (`pages/report.html`), and within how many bytes.
+PAGE_TITLE, HEAD = b"<title>mipmap_plugin</title>", 1000
 
 # What lies in the folder of a ladder of levels and says what its files are (`levels.manifest`).
 MANIFEST = "levels.json"
@@ -62,3 +69,16 @@ def state_path(output: Path) -> Path:
 def conversion_state(state: Path) -> Path:
     """The path of the state of the conversion before a run with that `state` (`adaptation.conversion`)."""
     return state.with_name(state.name + CONVERTED)
+
+
+def has_report(file: Path) -> bool:
+    """Whether the report of an adaptation lies beside a file; none does where its name would be too long."""
+    return os.path.isfile(file.with_name(file.name + REPORT))
+
+
+def page_at(path: Path) -> list[Path]:
+    """The page at `path`, if there is one: it goes with what it shows."""
+    if not path.is_file():
+        return []
+    with path.open("rb") as file:
+        return [path] if PAGE_TITLE in file.read(HEAD) else []

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from torch import Tensor
 
-from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.errors import CheckpointError, warn
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import recorded_filter, render_mode
@@ -67,7 +66,7 @@ def without_invalid(model: Model) -> Model:
     refuse_few(health.invalid, model.source)
     for doubt in health.doubts():
         if doubt not in model.notes:
-            warnings.warn(f"{model.source or 'this model'}: {doubt}", stacklevel=2)
+            warn(f"{model.source or 'this model'}: {doubt}")
             model = model.noted(doubt)
     if not health.invalid.any():
         return model
@@ -76,7 +75,7 @@ def without_invalid(model: Model) -> Model:
 
 def drop(model: Model, mask: Tensor, why: str, source: Path | str | None) -> Model:
     """A new model without the rows where `mask` [N] is True, with a note and a warning of their number. `source`: where they come from."""
-    return model.keep_rows(~mask).noted(dropped(mask, "splats", why, source))
+    return model.keep_rows(~mask).noted(dropped(mask, "splat", why, source))
 
 
 def as_tagged(trained: TrainedScale, comments: Sequence[str]) -> TrainedScale:

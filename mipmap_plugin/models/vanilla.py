@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import SettingsError, ShapeError
+from mipmap_plugin.errors import SettingsError, ShapeError, warn
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.glb import write_glb
 from mipmap_plugin.formats.ply import write_ply
@@ -216,7 +215,7 @@ class VanillaModel:
         comments = with_tags(self._origin.comments, self.trained.screen_filter, provenance, self.trained.eps2d)
         if is_written(path):
             for lost in filter(None, (without_place(path, self._origin.extras, self.sh_degree), cut_off(path, parameters))):
-                warnings.warn(lost, stacklevel=2)
+                warn(lost)
             exchanged = self._columns(parameters | {"shN": parameters["shN"][:, : (MOST_BANDS + 1) ** 2 - 1]})
             if is_glb(path):
                 return write_glb(path, exchanged, comments, overwrite=overwrite)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
-from mipmap_plugin.errors import TEMPORARY, CheckpointError
+from mipmap_plugin.errors import TEMPORARY, CheckpointError, warn
 from mipmap_plugin.formats.magic import archive
 from mipmap_plugin.formats.zipped import copied, only_ply, refuse_large
 from mipmap_plugin.models.places import PARTS
@@ -46,7 +46,7 @@ def retold(retell: Callable[[object], str]) -> Iterator[None]:
         except CheckpointError as error:
             raise CheckpointError(retell(error)) from error
     for doubt in doubts:
-        warnings.warn(retell(doubt.message), doubt.category, stacklevel=3)
+        warn(retell(doubt.message), doubt.category)
 
 
 def told(words: object) -> str:

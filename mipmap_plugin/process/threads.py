@@ -10,7 +10,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from contextvars import ContextVar, copy_context
 from functools import cache
 from operator import index
@@ -67,9 +67,10 @@ def for_views() -> int:
 def checked(threads: object) -> int:
     """A number of threads that may be asked for. Raises SettingsError for less than one, and for far more than the processor has."""
     most = MOST_PER_CORE * (os.cpu_count() or 1)
-    if not (isinstance(threads, SupportsIndex) and 1 <= index(threads) <= most):
-        raise SettingsError(f"threads must be at least 1, got {threads!r}; more than {most} are of no use on this machine")
-    return index(threads)
+    with suppress(TypeError):  # of an array, which has several
+        if isinstance(threads, SupportsIndex) and 1 <= index(threads) <= most:
+            return index(threads)
+    raise SettingsError(f"threads must be at least 1, got {threads!r}; more than {most} are of no use on this machine")
 
 
 def limit_torch(threads: int) -> None:

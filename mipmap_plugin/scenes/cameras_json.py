@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import count
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.camera import Camera, checked, viewmat_of
-from mipmap_plugin.errors import SceneError
+from mipmap_plugin.errors import SceneError, warn
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.json_file import MAX_SIDE, numbers, pixels, positive, present, read_json, rotation
 from mipmap_plugin.limits import path_of
@@ -99,7 +98,7 @@ def _tests(names: list[str], path: Path, cfg: dict[str, Any]) -> set[int]:
         return set(range(0, len(names), TEST_EVERY))
     if {*names[:first]} != {*by_name[::TEST_EVERY]}:
         order = "its cameras are neither in the order that 3DGS writes nor sorted by name"
-        warnings.warn(f"{path}: {order}, so the first {first} of {len(names)} are taken as the test views, which may be others", stacklevel=3)
+        warn(f"{path}: {order}, so the first {first} of {len(names)} are taken as the test views, which may be others")
     return leading
 
 

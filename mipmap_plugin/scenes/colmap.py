@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import SceneError, brief
+from mipmap_plugin.errors import SceneError, brief, plural, some_of
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import pixels
 from mipmap_plugin.scenes.base import ABSENT, SPLIT, Scene, note_on_shapes, other_shape
@@ -184,7 +184,8 @@ def _points(model: pycolmap.Reconstruction) -> Tensor | None:
 
 def _notes(cameras: list[Camera], photographs: dict[Camera, Path], folder: Path, lod: int | None) -> list[str]:
     tests = f"what lod={lod} holds out" if lod else f"every {TEST_EVERY}th"
-    notes = [f"{len(cameras)} cameras in the order of their names: {tests} {SPLIT}, the others for training"]
+    notes = [f"{plural(len(cameras), 'camera')} in the order of their names: {tests} {SPLIT}, the others for training"]
     if absent := len(cameras) - len(photographs):
-        notes.append(f"{absent} of {len(cameras)} photographs of the COLMAP model are {ABSENT} from {folder}; their cameras are views without one")
+        gone = some_of(absent, len(cameras), "photograph", "are")
+        notes.append(f"{gone} {ABSENT} from {folder}, though the COLMAP model names {'it' if absent == 1 else 'them'}")
     return notes

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera, viewmat_of
-from mipmap_plugin.errors import SceneError
+from mipmap_plugin.errors import SceneError, plural, some_of
 from mipmap_plugin.formats.images import image_size, is_file, read_array
 from mipmap_plugin.formats.json_file import numbers, pixels, positive, present, read_json, rotation
 from mipmap_plugin.scenes.base import Scene
@@ -57,7 +57,8 @@ def read_dynerf(path: Path, cfg: dict[str, Any] | None) -> Scene:
         return _videos_of_deformable(path, poses, cfg)
     videos = sorted({entry.name.partition(".")[0] for entry in path.glob("cam*")}) or [f"cam{number:02d}" for number in range(len(poses))]
     if len(videos) != len(poses):
-        raise SceneError(f"{path}: has {len(videos)} videos ({videos[0]}, ...), but poses_bounds.npy has {len(poses)} cameras; copy all of them")
+        has = f"has {plural(len(videos), 'video')} ({videos[0]}, ...)"
+        raise SceneError(f"{path}: {has}, but poses_bounds.npy has {plural(len(poses), 'camera')}; copy all of them")
     cameras: list[Camera] = []
     images: dict[Camera, Path] = {}
     for number, (video, pose) in enumerate(zip(videos, poses, strict=True)):
@@ -67,7 +68,7 @@ def read_dynerf(path: Path, cfg: dict[str, Any] | None) -> Scene:
             cameras.append(camera)
             if is_file(frame := path / video / "images" / f"{moment:04d}.png"):
                 images[camera] = frame
-    notes = [f"{len(videos)} videos of {FRAMES} frames; the first is for testing, the others are seen at {FRAMES} moments in turn"]
+    notes = [f"{plural(len(videos), 'video')} of {FRAMES} frames; the first is for testing, the others are seen at {FRAMES} moments in turn"]
     return Scene(tuple(cameras), images, path, notes, as_4dgaussians=True)
 
 
@@ -99,7 +100,7 @@ def read_hypernerf(path: Path, cfg: dict[str, Any] | None) -> Scene:
             images[camera] = photograph
     if not cameras:
         raise SceneError(f"{path / 'dataset.json'}: lists no view; copy it again")
-    notes = [f"{len(cameras)} of {len(names)} views of a HyperNeRF capture, at 1/{shrunk} of its size"]
+    notes = [f"{some_of(len(cameras), len(names), 'view')} of a HyperNeRF capture, at 1/{shrunk} of its size"]
     return Scene(tuple(cameras), images, path, notes, as_4dgaussians=not deformable)
 
 
@@ -107,7 +108,8 @@ def _videos_of_deformable(path: Path, poses: Tensor, cfg: dict[str, Any]) -> Sce
     """The views of `poses` [P, 3, 5]; without frames at the recorded size. The focal length is that of the first camera, in pixels of the frames."""
     folders = sorted(folder for folder in path.glob("frames/*") if folder.is_dir())
     if folders and len(folders) != len(poses):
-        raise SceneError(f"{path / 'frames'}: has {len(folders)} videos, but poses_bounds.npy has {len(poses)} cameras; copy all of them")
+        has = f"has {plural(len(folders), 'video')}"
+        raise SceneError(f"{path / 'frames'}: {has}, but poses_bounds.npy has {plural(len(poses), 'camera')}; copy all of them")
     height, width, focal = (positive(value, f"{path / 'poses_bounds.npy'}, row 0") for value in poses[0, :, 4].tolist())
     recorded, resized = (max(1, round(width)), max(1, round(height))), {"resolution": cfg.get("resolution", 1)}
     cameras: list[Camera] = []
@@ -124,7 +126,8 @@ def _videos_of_deformable(path: Path, poses: Tensor, cfg: dict[str, Any]) -> Sce
             cameras.append(camera.resized(*trained_size(across, down, resized)))
             if folders:
                 images[cameras[-1]] = frame
-    return Scene(tuple(cameras), images, path, [f"{len(poses)} videos of {FRAMES_OF_DEFORMABLE} frames, as Deformable 3D Gaussians reads them"])
+    note = f"{plural(len(poses), 'video')} of {FRAMES_OF_DEFORMABLE} frames, as Deformable 3D Gaussians reads them"
+    return Scene(tuple(cameras), images, path, [note])
 
 
 def _of_video(pose: Tensor, video: str, moment: int, split: Literal["train", "test"], where: str) -> Camera:

@@ -68,11 +68,12 @@ class TileJob(Job):
 
     def _adapt(self, tile: Tile) -> None:
         saved, facts, keeper = tile.adapt(state_path(self.target))
-        with together(self.target):
+        state = keeper and keeper.remaining_file()
+        with together(self.target, state.files if state else []):
             save_torch(self.target, saved, overwrite=True)
             write_json(facts_file(self.target), facts, overwrite=True)
-        if keeper is not None and (state := keeper.remaining_file()) is not None:
-            state.remove()
+        if state:
+            state.release()
 
 
 def facts_file(target: Path) -> Path:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.errors import MipmapPluginError, SettingsError
-from mipmap_plugin.formats.atomic import new_file, refuse_output, refuse_unwritable, sha256, write_json
+from mipmap_plugin.formats.atomic import new_file, refuse_output, refuse_unwritable, settled, sha256, write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.formats.staging import claim as lock
@@ -57,7 +57,7 @@ def alone(jobs: Sequence[Job]) -> Iterator[None]:
         for folder in dict.fromkeys(work_folder(job.target) for job in jobs):
             held.callback(remove_empty, missing_folders(folder.parent))
             folder.parent.mkdir(parents=True, exist_ok=True)
-            place = _lock_of(folder)
+            place = lock_of(folder)
             if (descriptor := lock(place)) is None:
                 raise SettingsError(f"{folder}: another command is making these tiles; wait until it has ended, or choose another output")
             held.callback(release, place, descriptor)
@@ -66,13 +66,14 @@ def alone(jobs: Sequence[Job]) -> Iterator[None]:
 
 def unlock(jobs: Sequence[Job]) -> None:
     """Remove the locks of a command that was killed, as far as the system lets this one: of jobs that are finished, which need none any more."""
-    for place in (_lock_of(work_folder(job.target)) for job in jobs):
+    for place in (lock_of(work_folder(job.target)) for job in jobs):
         with suppress(OSError):
             if place.exists() and (descriptor := lock(place)) is not None:
                 release(place, descriptor)
 
 
-def _lock_of(folder: Path) -> Path:
+def lock_of(folder: Path) -> Path:
+    """The lock of whoever works in a work folder."""
     return folder.with_name(f".{folder.name}.lock")
 
 
@@ -86,7 +87,7 @@ def claim(jobs: Sequence[Job], tiles: int) -> None:
     digest = sha256(find_splats(jobs[0].base.checkpoint)[0].path)
     plans = {work_folder(job.target): _plan(job, tiles, digest) for job in jobs}
     for folder, plan in plans.items():
-        if (folder / PLAN).exists():
+        if settled(folder / PLAN).exists():
             if read_json(folder / PLAN) != json.loads(json.dumps(plan)):
                 others = "tiles of another base, settings or number of tiles, or of another version"
                 raise SettingsError(f"{folder} holds {others}; repeat those, or delete it to start anew")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mipmap_plugin.errors import CheckpointError, SettingsError
+from mipmap_plugin.errors import CheckpointError, SettingsError, plural, warn
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.ply_rows import PlyRows
 from mipmap_plugin.formats.torch_file import save_torch
@@ -60,14 +59,14 @@ def make_cut(path: Path, tiles: int, folder: Path) -> None:
     refuse_few(~valid, checkpoint.path)
     kept = valid.nonzero()[:, 0]
     if len(kept) < tiles:
-        raise CheckpointError(f"{checkpoint.path} has {len(kept):,} splats, which cannot be cut into {tiles} tiles; give fewer")
+        raise CheckpointError(f"{checkpoint.path} has {plural(len(kept), 'splat')}, which cannot be cut into {tiles} tiles; give fewer")
     cores, tree = cut(splats.places[:, :3], kept, tiles)  # without sizes, which are no places
     if not found.drawn:
         raise CheckpointError(f"{checkpoint.path}: every splat has an opacity below 1/255, so none is drawn; the training or the export failed")
     told = found.doubts(len(rows))
     for doubt in told:
-        warnings.warn(f"{checkpoint.path}: {doubt}", stacklevel=2)
-    told += [] if valid.all() else [dropped(~valid, "splats", "not finite once activated", checkpoint.path)]
+        warn(f"{checkpoint.path}: {doubt}")
+    told += [] if valid.all() else [dropped(~valid, "splat", "not finite once activated", checkpoint.path)]
     told += second_colors(rows.header.vertex.names)
     degree_at = found.degree_at if found.highest >= 0 else int(kept[0])
     sample = torch.cat([kept[:: -(-len(kept) // SAMPLE)], torch.tensor([degree_at])]).unique()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from mipmap_plugin.adaptation.optimization.amount import fewer_note
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report, filters, simulated, versions
 from mipmap_plugin.adaptation.target.upsamplers import network_input
-from mipmap_plugin.errors import plural
+from mipmap_plugin.errors import plural, warn
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.models.mip import unread
@@ -53,7 +52,7 @@ def make_report(
     lost = [f"the extra columns {', '.join(scene.extras)} are dropped, since tiles hold none"] if scene.extras else []
     lost += [sentence for sentence in [unread(scene.viewer, model, files[0])] if sentence]
     for note in lost:
-        warnings.warn(note, stacklevel=2)
+        warn(note)
     last = CurvePoint(step=steps, seconds=seconds["total"], validation_db=validation.get(returned, 0.0), gaussians=after)
     return Report(
         scale=scene.scale,

@@ -16,7 +16,7 @@ from mipmap_plugin.adaptation.report import AS_IT_IS, Report
 from mipmap_plugin.adaptation.shown import refuse_blind, remarks, too_unlike
 from mipmap_plugin.adaptation.target.detail import unused_upsampler
 from mipmap_plugin.adaptation.warn import warn
-from mipmap_plugin.errors import BackendUnavailable, JobsFailed, SceneError, SettingsError
+from mipmap_plugin.errors import BackendUnavailable, JobsFailed, SceneError, SettingsError, some_of
 from mipmap_plugin.formats.atomic import delete, new_file, together, write_json
 from mipmap_plugin.formats.here import told_from_here
 from mipmap_plugin.formats.ply_rows import concatenate
@@ -31,7 +31,7 @@ from mipmap_plugin.process.freed_memory import return_freed_memory
 from mipmap_plugin.progress import announced, counted
 from mipmap_plugin.tiles.folder import START, halo_file, layer_file, part_file, run_file, steered_file, truth_file, work_folder
 from mipmap_plugin.tiles.job import TileJob, Work
-from mipmap_plugin.tiles.plan import alone, claim, cut_for, refuse
+from mipmap_plugin.tiles.plan import alone, claim, cut_for, lock_of, refuse
 from mipmap_plugin.tiles.report import JOINED, judged, make_report
 from mipmap_plugin.tiles.scene import TiledScene, close_opened, opened
 from mipmap_plugin.tiles.steering import Steered, open_state, result, sweep_of
@@ -129,7 +129,6 @@ def _adapted_and_saved(scene: TiledScene, stages: _Stages, began: float, threads
         report = make_report(scene, files, facts, stages.seconds, validation, returned)
         saved = _save(scene, stages.job, files, Joined(stages.job.target, report, facts))
     close_opened()
-    delete(scene.folder, stages.job.target)
     return saved
 
 
@@ -217,7 +216,7 @@ def _done(jobs: Sequence[Job], engine: Engine, what: str) -> list[Outcome]:
         running.close()
     if failed := [outcome for outcome in outcomes if outcome.status not in ("done", "finished before")]:
         reasons = told_from_here("; ".join(dict.fromkeys(outcome.reason for outcome in failed)))
-        raise JobsFailed(f"{len(failed)} of {len(jobs)} jobs ({what}) failed: {reasons}; the same command does these again, and no other")
+        raise JobsFailed(f"{some_of(len(failed), len(jobs), 'job')} ({what}) failed: {reasons}; the same command does these again, and no other")
     return outcomes
 
 
@@ -230,7 +229,7 @@ def _save(scene: TiledScene, job: Job, files: Sequence[Path], joined: Joined) ->
         with new_file(ply, overwrite) as temporary, temporary.open("xb") as out:
             concatenate(files, comments, out)
 
-    with together(job.target):
+    with together(job.target, [scene.folder, lock_of(scene.folder)]):
         if job.target.suffix.lower() == ".ply":
             write(saved := job.target, job.overwrite)
         else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
@@ -23,6 +22,7 @@ from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import warn
 from mipmap_plugin.formats.ply_rows import PlyRows
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.jobs.base import COLORS, Base
@@ -109,7 +109,7 @@ class TiledScene:
         """The views of the whole scene, as without tiles but for captures without cameras: a sample of their splats tells how near views are."""
         cameras = seeing(self.wrapped.cameras, self.base.places[:, :3], self.target.near_plane)
         if not cameras and self.config.views != "orbit":
-            warnings.warn(orbited(self.checkpoint.path, self.viewpoints.orbit), stacklevel=1)
+            warn(orbited(self.checkpoint.path, self.viewpoints.orbit))
         chosen, note = choose_views(cameras, self.viewpoints, self.config)
         adapted, validation = split_validation(cameras, chosen, self.viewpoints, self.scale, self.config)
         note += f", {len(chosen) - len(adapted)} of them kept for validation" if len(adapted) < len(chosen) else ""

@@ -12,7 +12,7 @@ from http import HTTPStatus
 from importlib import import_module
 from typing import Any
 
-from mipmap_plugin.errors import SettingsError, install
+from mipmap_plugin.errors import SettingsError, install, warn
 
 # Said on the terminal, because the page itself only waits: the page may be the right one behind a proxy.
 FOREIGN = "a page of {origin} asked for this one's pictures, and got none; if it is this one behind a proxy, let it pass on Host or X-Forwarded-Host"
@@ -48,7 +48,7 @@ def _own_pages_only() -> Iterator[None]:
         def answer(connection: Any, request: Any) -> Any:
             if not foreign_page(request.headers):
                 return process_request(connection, request)
-            warnings.warn(FOREIGN.format(origin=ascii(request.headers["Origin"])), stacklevel=1)  # ours, as the command hides others
+            warn(FOREIGN.format(origin=ascii(request.headers["Origin"])))  # ours, as the command hides others
             return connection.respond(HTTPStatus.FORBIDDEN, "this page is not that of the live view\n")
 
         return serve(*args, process_request=answer, **options)

@@ -32,7 +32,7 @@ def test_cameras_that_show_nothing_are_refused():
     behind = torch.eye(4)
     behind[2, 3] = -1000.0  # all splats lie behind it
     away = replace(tiny.cameras(1)[0], viewmat=behind)
-    with pytest.raises(SettingsError, match="none of the 1 views shows a splat"):
+    with pytest.raises(SettingsError, match="none of 1 view shows a splat"):
         wrap_model(tiny.model(), cameras=[away]).adapt(0.5, steps=0, views="given")
 
 
@@ -64,7 +64,7 @@ def test_views_that_lose_while_the_others_gain_are_told_of_with_their_lenses():
     """Two of four lose, both through lenses of three times the focal length."""
     views = [replace(view, fx=times * view.fx, fy=times * view.fy) for view, times in zip(tiny.cameras(4), (1, 3, 1, 3), strict=True)]
     [told] = worse_views(views, [20.0, 36.0, 20.0, 30.0], [30.0, 28.0, 30.0, 29.0], 1 / 4)
-    assert told.startswith("in 2 of the 4 views that it was chosen by, the file for x0.25 looks worse than the base, by up to 8.0 dB")
+    assert told.startswith("in 2 of 4 views that it was chosen by, the file for x0.25 looks worse than the base, by up to 8.0 dB")
     assert f"of {3 * views[0].fx:.0f} px and more, where the shortest has {views[0].fx:.0f} px: adapt with the cameras of each lens" in told
 
 

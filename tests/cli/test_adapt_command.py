@@ -13,6 +13,7 @@ import tiny
 from commands_run import NO_STEP, QUICK, refused
 from pages_read import record_of
 
+from mipmap_plugin.errors import OutputError
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models import load_model
@@ -154,3 +155,24 @@ def test_ctrl_c_anywhere_else_says_interrupted(run, model_folder, monkeypatch):
     monkeypatch.setattr("mipmap_plugin.models.load_model", lambda *_, **__: signal.raise_signal(signal.SIGINT))
     code, _, err = run("inspect", model_folder)
     assert code == 130 and err.strip() == "mipmap-plugin: interrupted"
+
+
+def test_a_page_goes_with_the_file_that_it_shows(run, model_folder, tmp_path):
+    words = ["adapt", model_folder, "--scale", "1/2", "--output", tmp_path / "a.ply", "--recipe", "instant"]
+    run(*words, "--report")
+    assert (tmp_path / "a.ply.report.html").exists()
+    run(*words, "--overwrite")
+    assert (tmp_path / "a.ply").exists() and not (tmp_path / "a.ply.report.html").exists()
+
+
+def test_a_file_whose_page_cannot_be_written_does_not_appear_without_it(run, model_folder, tmp_path, monkeypatch):
+    def full(*_):
+        raise OutputError("the disk is full")
+
+    words = ["adapt", model_folder, "--scale", "1/2", "--output", tmp_path / "a.ply", "--recipe", "instant", "--report"]
+    with monkeypatch.context() as failing:
+        failing.setattr("mipmap_plugin.pages.html.write_page", full)
+        assert "the disk is full" in refused(run(*words))
+    assert not (tmp_path / "a.ply").exists()
+    run(*words)
+    assert (tmp_path / "a.ply").exists() and (tmp_path / "a.ply.report.html").exists()

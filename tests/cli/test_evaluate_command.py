@@ -57,7 +57,7 @@ def test_evaluate_says_which_rows_are_missing_and_that_no_row_is_exposed(run, mo
     monkeypatch.setattr(ReferenceBackend, "capabilities", few)
     (model_folder / "exposure.json").write_text(json.dumps({"view_0": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}))
     words = ["evaluate", model_folder, "--images", tiny.scene(tmp_path / "scene"), "--backend", "reference"]
-    exposed = "exposure.json changes 1 of 1 images, which is not applied here: part of every difference from a photograph is exposure"
+    exposed = "exposure.json changes 1 of 1 image, which is not applied here: part of every difference from a photograph is exposure"
     missing = r"there is no row 'window', since backend 'reference' cannot do this(, but cpu can)?: it has the screen filters .*, not window"
     code, out, _ = run(*words, "--scale", "1/2")
     assert code == 0 and re.fullmatch(missing, out.splitlines()[-3]) and out.splitlines()[-2] == exposed and "| window" not in out
@@ -96,7 +96,7 @@ def test_evaluate_says_that_the_base_was_trained_on_what_is_judged(run, model_fo
         (None, unmarked, 4, all_of_them),
         ("Namespace(eval=False)", marked, 2, both),
         ("Namespace(eval=True, train_test_exp=True)", marked, 2, halves),
-        ("Namespace(eval=True)", marked, 2, "1 of 2 photographed test views of marked are no test views of the checkpoint: it was trained on them"),
+        ("Namespace(eval=True)", marked, 2, "the checkpoint was trained on 1 of 2 photographed test views of marked, whose test views are"),
         ("Namespace(eval=True, lod=30)", marked, 2, None),  # Scaffold-GS's option, by which other views are for testing
         (None, marked, 2, None),
     ]:

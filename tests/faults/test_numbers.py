@@ -141,7 +141,7 @@ def test_a_live_model_loses_the_rows_that_a_file_would_lose(tmp_path, values):
 def test_a_live_model_without_a_finite_row_is_refused():
     parameters = tiny.model(10).parameters()
     parameters["means"] = parameters["means"] * math.nan
-    with pytest.raises(CheckpointError, match="this model: none of its 10 splats is finite"):
+    with pytest.raises(CheckpointError, match="this model: none of 10 splats is finite"):
         wrap_model(VanillaModel(parameters))
 
 
@@ -149,7 +149,7 @@ def test_a_live_model_of_another_family_with_a_nan_is_refused(tmp_path):
     model = load_model(SAMPLES["ply of Mip-Splatting"].make(tmp_path / "m")).copy()
     with torch.no_grad():
         model.parameters()["means"][2] = math.nan
-    with pytest.raises(SettingsError, match="this MipModel holds a NaN in means of 1 of its 12 rows"):
+    with pytest.raises(SettingsError, match="this MipModel holds a NaN in means of 1 of 12 rows"):
         wrap_model(model)
 
 

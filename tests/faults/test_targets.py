@@ -304,3 +304,8 @@ def test_a_cache_that_holds_something_else_is_made_anew(tmp_path, monkeypatch, c
     torch.save(content, tmp_path / "ab/ab.pt")
     assert torch.equal(disk_cache.cached("ab", lambda: torch.zeros(2, 2, 3)), torch.zeros(2, 2, 3))
     assert torch.equal(disk_cache.cached("ab", lambda: pytest.fail("made again")), torch.zeros(2, 2, 3))
+
+
+def test_a_name_that_leaves_no_room_for_a_reports_is_read(tmp_path):
+    base = tiny.ply(tmp_path / "base.ply", count=20).rename(tmp_path / f"{'a' * 246}.ply")
+    assert main(["adapt", str(base), "--scale", "1/2", "--output", str(tmp_path / "new.ply"), *INSTANT]) == 0

@@ -149,10 +149,11 @@ def test_levels_that_a_killed_ladder_was_deleting_are_in_nobodys_way(tmp_path, m
     state, close = tmp_path / "state", staging.Staging.close
     ladder = make_levels(wrapped(), request(coarsest=1.0), resume=state)
     with monkeypatch.context() as patched:
-        patched.setattr(staging.Staging, "close", lambda self: os.close(self._lock) if (self.new / "state").exists() else close(self))
+        patched.setattr(staging.Staging, "close", lambda self: os.close(self._lock) if self.path.name == "ladder" else close(self))
         ladder.save(tmp_path / "ladder")
-    assert not state.exists() and (tmp_path / ".state.0.tmp").exists()
-    assert make_levels(wrapped(), request(coarsest=1.0), resume=state).levels and not (tmp_path / ".state.0.tmp").exists()
+    assert not state.exists() and (tmp_path / ".ladder.0.tmp").exists()
+    assert make_levels(wrapped(), request(coarsest=1.0), resume=state).save(tmp_path / "ladder", overwrite=True)
+    assert {path.name for path in tmp_path.iterdir()} == {"ladder"}
 
 
 def test_a_ladder_whose_first_level_has_a_state_keeps_it(tmp_path, monkeypatch):
@@ -235,6 +236,8 @@ def test_an_export_that_failed_is_made_by_the_same_command(tmp_path, monkeypatch
         failing.setattr(Exports, "write", lambda *_: (_ for _ in ()).throw(OutputError("the disk is full")))
         assert cli.main(words) == 2
     assert "ladder has the levels, and the same command goes on from these" in capsys.readouterr().err
+    (tmp_path / "ladder" / ".report.html.0.tmp" / "new").mkdir(parents=True)
+    (tmp_path / "ladder" / ".report.html.0.tmp" / "new" / "report.html").touch()  # of a run that was killed as it wrote its page
     assert cli.main([*words, "--seed", "1"]) == 2  # another ladder does not replace it
     assert "holds levels of another base, viewer or settings" in capsys.readouterr().err
     assert cli.main(words) == 0 and {path.name for path in tmp_path.iterdir()} == {"base", "ladder"}

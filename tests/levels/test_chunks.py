@@ -257,5 +257,5 @@ def test_a_place_is_measured_once_where_levels_end_before_walks_begin(small_chun
 
 def test_cameras_that_see_nothing_are_refused():
     base = wrap_model(wrapped().model, cameras=[from_x(1e6)])
-    with pytest.raises(SettingsError, match="none of the 1 views shows a splat"):
+    with pytest.raises(SettingsError, match="none of 1 view shows a splat"):
         base.levels("classic", by="distance")

@@ -140,7 +140,7 @@ def test_anchors_that_are_not_finite_are_dropped_and_counted(tmp_path):
 
 def test_a_checkpoint_without_a_finite_anchor_is_refused(tmp_path):
     ply = checkpoints.write(tmp_path / "model", x=np.full(40, np.nan))
-    refused(ply, "none of its 40 anchors is finite")
+    refused(ply, "none of 40 anchors is finite")
 
 
 def test_a_column_that_nothing_reads_costs_no_anchor(tmp_path):

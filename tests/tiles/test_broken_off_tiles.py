@@ -191,10 +191,9 @@ def test_a_scale_that_is_interrupted_leaves_the_others_what_they_share(job, monk
 
 def test_a_run_that_is_killed_while_it_deletes_its_tiles_is_in_nobodys_way(job, monkeypatch):
     """What was left of them had no plan, and was taken for other things."""
-    job = replace(job, settings=job.settings | {"steps": 0}, overwrite=True)
-    close = staging.Staging.close
+    job, close = replace(job, settings=job.settings | {"steps": 0}, overwrite=True), staging.Staging.close
     with monkeypatch.context() as patched:
-        patched.setattr(staging.Staging, "close", lambda self: os.close(self._lock) if (self.new / "out.ply.tiles").exists() else close(self))
+        patched.setattr(staging.Staging, "close", lambda self: os.close(self._lock) if self.path == job.target else close(self))
         adapt_in_tiles(job, 2)
     assert not work_folder(job.target).exists() and list(job.target.parent.glob(".out.ply.?.tmp"))
     adapt_in_tiles(job, 2)
@@ -230,4 +229,21 @@ def test_two_commands_do_not_make_the_same_tiles(job):
         yield from in_this_process(jobs)
 
     assert adapt_in_tiles(job, 3, engine).file.is_file() and asked
+    assert {path.name for path in job.target.parent.iterdir()} == {"scene", "out.ply", "out.ply.adaptation.json"}
+
+
+def test_what_a_run_that_was_killed_at_its_plan_leaves_is_in_nobodys_way(job):
+    (work_folder(job.target) / f".{PLAN}.0.tmp" / "new").mkdir(parents=True)
+    assert adapt_in_tiles(replace(job, settings=job.settings | {"steps": 0}), 2).file.exists()
+
+
+def test_the_lock_of_tiles_goes_with_them(job, monkeypatch):
+    """Also where the run is killed as its output appears."""
+    close = staging.Staging.close
+    with monkeypatch.context() as patched:
+        patched.setattr(staging.Staging, "close", lambda self: os.close(self._lock) if self.path == job.target else close(self))
+        patched.setattr(plan, "release", lambda folder, lock: os.close(lock))
+        adapt_in_tiles(replace(job, settings=job.settings | {"steps": 0}), 2)
+    with pytest.raises(OutputExists):
+        adapt_in_tiles(job, 2)
     assert {path.name for path in job.target.parent.iterdir()} == {"scene", "out.ply", "out.ply.adaptation.json"}

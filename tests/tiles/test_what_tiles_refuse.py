@@ -134,7 +134,7 @@ def test_views_that_show_nothing_are_refused_and_leave_no_folder(job):
     around = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
     views = [replace(view, viewmat=around @ view.viewmat) for view in tiny.cameras(3, width=20, height=16)]
     folder = tiny.folder(job.base.checkpoint.with_name("other"), views)
-    with pytest.raises(SettingsError, match="none of the 3 views shows a splat: the cameras seem to be of another scene"):
+    with pytest.raises(SettingsError, match="none of 3 views shows a splat: the cameras seem to be of another scene"):
         adapt_in_tiles(replace(job, base=replace(job.base, cameras=folder / "cameras.json")), 2)
     assert not work_folder(job.target).exists()
 

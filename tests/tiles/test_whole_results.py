@@ -16,6 +16,7 @@ from mipmap_plugin import register_viewer
 from mipmap_plugin.adaptation.optimization import loop
 from mipmap_plugin.camera import viewmat_of
 from mipmap_plugin.cli import main
+from mipmap_plugin.formats import staging
 from mipmap_plugin.formats.ply import read_header, read_ply
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.levels.distance.mixture import together
@@ -36,7 +37,14 @@ from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
 
 def test_a_scene_in_tiles_is_whole_and_better_than_its_base(job, monkeypatch):
     bodies = []
-    monkeypatch.setattr(run, "delete", lambda folder, _: bodies.extend((folder / f"part_{n}.ply").read_bytes() for n in range(3)))
+    remove = staging._remove
+
+    def read_before(path, folder):
+        if path.name == "out.ply.tiles":
+            bodies.extend((path / f"part_{n}.ply").read_bytes() for n in range(3))
+        remove(path, folder)
+
+    monkeypatch.setattr(staging, "_remove", read_before)
     joined = adapt_in_tiles(replace(job, settings=job.settings | {"merge_to": 0.6}), 3)
     report = joined.report
     assert len(load_vanilla(joined.file)) == report.gaussians_after == sum(tile["splats_after"] for tile in joined.tiles[-3:])

@@ -267,7 +267,7 @@ def test_ctrl_c_keeps_what_was_measured_and_says_where(tmp_path, monkeypatch):
         return judged(point, show, yardstick, repeats)
 
     monkeypatch.setattr(measuring, "_measured", tired)
-    with pytest.raises(Interrupted, match=f"the 4 points measured so far are in {tmp_path}"):
+    with pytest.raises(Interrupted, match=f"the 4 points measured so far: {tmp_path}"):
         run(wrapped(), None, [1 / 4, 4], PLAN, 1, Folder(tmp_path, picture=False, overwrite=False))
     told = json.loads((tmp_path / "tradeoff.json").read_text())
     assert not told["complete"] and [len(each["points"]) for each in told["scales"]] == [4]

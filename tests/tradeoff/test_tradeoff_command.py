@@ -7,6 +7,7 @@ import pytest
 import tiny
 
 from mipmap_plugin import cli
+from mipmap_plugin.errors import OutputError
 from mipmap_plugin.evaluation.tradeoff import measuring
 from mipmap_plugin.limits import MAX_SEED
 
@@ -51,3 +52,21 @@ def test_pictures_without_matplotlib_are_refused_before_anything_is_measured(tmp
     assert command(tmp_path, "--picture") == 2
     assert "pip install 'mipmap-plugin[plot]'" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
+
+
+def test_a_page_that_cannot_be_written_is_written_by_the_same_command(tmp_path, capsys, monkeypatch):
+    def full(*_):
+        raise OutputError("the disk is full")
+
+    with monkeypatch.context() as failing:
+        failing.setattr("mipmap_plugin.pages.html.write_page", full)
+        assert command(tmp_path, "--report") == 2 and "the disk is full" in capsys.readouterr().err
+    assert {path.name for path in (tmp_path / "new").iterdir()} == {"tradeoff.resume"}
+    monkeypatch.setattr(measuring, "adapt_alone", lambda *_, **__: pytest.fail("what was measured is kept"))
+    assert command(tmp_path, "--report") == 0
+    assert {path.name for path in (tmp_path / "new").iterdir()} == {"tradeoff.json", "tradeoff.csv", "report.html"}
+
+
+def test_a_page_goes_with_the_results_that_it_shows(tmp_path):
+    assert command(tmp_path, "--report") == 0 and (tmp_path / "new" / "report.html").exists()
+    assert command(tmp_path, "--overwrite") == 0 and not (tmp_path / "new" / "report.html").exists()

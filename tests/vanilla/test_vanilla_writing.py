@@ -192,5 +192,5 @@ def test_real_training_options(shared_data):
 
 
 def test_real_file_of_nothing_but_nan_is_refused(shared_data):
-    with pytest.raises(CheckpointError, match="none of its 1 splats is finite"):
+    with pytest.raises(CheckpointError, match="none of 1 splat is finite"):
         load_model(shared_data / "checkpoints/fixtures/nan-opacity-binary-le.ply")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -20,7 +19,7 @@ from mipmap_plugin.adaptation.optimization.state_file import StateFile, claim_st
 from mipmap_plugin.adaptation.optimization.steering import Steering
 from mipmap_plugin.adaptation.report import versions
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.errors import CheckpointError, OutputError, SettingsError
+from mipmap_plugin.errors import CheckpointError, OutputError, SettingsError, warn
 from mipmap_plugin.formats.atomic import refuse_output
 from mipmap_plugin.formats.torch_file import load_torch, save_torch
 from mipmap_plugin.models.base import SplatModel
@@ -57,7 +56,7 @@ class StateKeeper:
         try:
             self.file = claim_state_file(self._requested, self._whose)
         except OSError as error:
-            warnings.warn(f"{self._requested} cannot be written ({error.strerror}), so that this run could not be resumed", stacklevel=2)
+            warn(f"{self._requested} cannot be written ({error.strerror}), so that this run could not be resumed")
         state, self._state = self._state, None
         if state is None:
             try:
@@ -99,7 +98,7 @@ class StateKeeper:
         try:
             save_run(run, self._path, self._fingerprint)
         except OutputError as error:
-            warnings.warn(f"the run continues, but could not be resumed if it were killed: {error}", stacklevel=2)
+            warn(f"the run continues, but could not be resumed if it were killed: {error}")
 
     def remaining_file(self) -> StateFile | None:
         """The state file of a run that has ended, which is needed until its model is saved; None if none was written."""

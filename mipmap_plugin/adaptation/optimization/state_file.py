@@ -18,6 +18,11 @@ class StateFile:
         self.path, self._made = path, made
         self._lock: int | None = lock
 
+    @property
+    def files(self) -> list[Path]:
+        """The state and its lock."""
+        return [self.path, _lock_of(self.path)]
+
     def remove(self) -> None:
         """Delete the state, which is no longer needed."""
         self.path.unlink(missing_ok=True)

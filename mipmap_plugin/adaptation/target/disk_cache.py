@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import os
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from mipmap_plugin.errors import CheckpointError, OutputError, OutputExists
+from mipmap_plugin.errors import CheckpointError, OutputError, OutputExists, warn
 from mipmap_plugin.formats.torch_file import load_torch, save_torch
 
 VARIABLE = "MIPMAP_PLUGIN_CACHE"
@@ -43,7 +42,7 @@ def cached(name: str, make: Callable[[], Tensor]) -> Tensor:
     try:
         save_torch(file, image, overwrite=True)
     except (OutputError, OutputExists) as error:
-        warnings.warn(f"the image is not cached: {error}; set the variable {VARIABLE} to another folder", stacklevel=2)
+        warn(f"the image is not cached: {error}; set the variable {VARIABLE} to another folder")
     return image.float()
 
 

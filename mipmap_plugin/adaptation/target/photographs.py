@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera, evenly
-from mipmap_plugin.errors import SettingsError, type_of
+from mipmap_plugin.errors import SettingsError, some_of, type_of
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.base import Placed, SplatModel
 from mipmap_plugin.models.hosts import Capture
@@ -141,7 +141,8 @@ def placed(model: SplatModel, scene: Scene, cameras: Sequence[Camera] = ()) -> S
     there = scene.with_cameras(cast(Placed, model).as_trained(scene.cameras, capture))
     if [camera.split for camera in there.cameras] == [camera.split for camera in scene.cameras]:
         return there
-    tests = f"the checkpoint's options hold out {len(there.split('test'))} of {len(there.cameras)} views: these are for testing"
+    held_out = some_of(len(there.split("test")), len(there.cameras), "view")
+    tests = f"the checkpoint's options hold out {held_out}: these are for testing"
     return replace(there, notes=[*(note for note in there.notes if SPLIT not in note), tests])
 
 

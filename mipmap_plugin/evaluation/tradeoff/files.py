@@ -7,7 +7,7 @@ import io
 import json
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,8 @@ from mipmap_plugin.evaluation.report import markdown
 from mipmap_plugin.evaluation.tradeoff.front import Tradeoff, files, frames, front, milliseconds, seconds
 from mipmap_plugin.evaluation.tradeoff.plot import draw, figure_class
 from mipmap_plugin.evaluation.tradeoff.points import Point, Spread
-from mipmap_plugin.formats.atomic import new_file, refuse_output, refuse_unwritable, write_json
+from mipmap_plugin.formats.atomic import new_file, refuse_output, refuse_unwritable, settled, together, write_json
+from mipmap_plugin.models.places import PAGE, page_at
 
 NAMES = ("tradeoff.json", "tradeoff.csv", "tradeoff.png")
 
@@ -48,6 +49,7 @@ class Folder:
     path: Path
     picture: bool  # whether to write the plot
     overwrite: bool
+    page: Callable[[Sequence[Tradeoff]], Any] | None = None  # what writes the page of all results, if there is to be one
 
     @property
     def files(self) -> list[Path]:
@@ -57,7 +59,7 @@ class Folder:
 
 def goes_on(folder: Folder) -> Folder:
     """The folder, whose results are replaced if they are those of an interrupted command, which are incomplete."""
-    return replace(folder, overwrite=folder.overwrite or ((folder.path / KEPT).is_dir() and not _is_complete(folder.path / NAMES[0])))
+    return replace(folder, overwrite=folder.overwrite or ((folder.path / KEPT).is_dir() and not _is_complete(settled(folder.path / NAMES[0]))))
 
 
 def refuse(folder: Folder) -> None:
@@ -81,8 +83,21 @@ def _is_complete(file: Path) -> bool:
 
 
 def write(folder: Folder, tradeoffs: Sequence[Tradeoff], *, complete: bool) -> None:
-    """Write JSON, CSV and plot, each atomically. Raises OutputExists, OutputError, and SettingsError without matplotlib."""
-    write_json(folder.path / NAMES[0], facts(tradeoffs, complete), folder.overwrite)
+    """Write JSON, CSV, plot and page, all at once, and remove what was kept once results are complete.
+
+    Raises OutputExists, OutputError, and SettingsError without matplotlib.
+    """
+    spent = [*page_at(folder.path / PAGE), *([folder.path / KEPT] if complete else [])]
+    with together(folder.path / NAMES[0], spent):
+        write_json(folder.path / NAMES[0], facts(tradeoffs, complete), folder.overwrite)
+        _write_table(folder, tradeoffs)
+        if folder.picture:
+            draw(folder.path / NAMES[2], tradeoffs, folder.overwrite)
+        if complete and folder.page is not None:
+            folder.page(tradeoffs)
+
+
+def _write_table(folder: Folder, tradeoffs: Sequence[Tradeoff]) -> None:
     text = io.StringIO(newline="")
     rows = [{"truth": each.truth, **_flat(point)} for each in tradeoffs for point in each.points]
     writer = csv.DictWriter(text, fieldnames=list(rows[0]) if rows else ["truth"])
@@ -90,8 +105,6 @@ def write(folder: Folder, tradeoffs: Sequence[Tradeoff], *, complete: bool) -> N
     writer.writerows(rows)
     with new_file(folder.path / NAMES[1], folder.overwrite) as temporary:
         temporary.write_text(text.getvalue(), encoding="utf-8", newline="")
-    if folder.picture:
-        draw(folder.path / NAMES[2], tradeoffs, folder.overwrite)
 
 
 def _flat(point: Point) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, plural
 from mipmap_plugin.evaluation.cells import Cells
 from mipmap_plugin.evaluation.protocols import not_exposed, not_held_out
 from mipmap_plugin.evaluation.tradeoff.files import KEPT, Folder, goes_on, write
@@ -42,8 +42,7 @@ def run(model: Wrapped, scene: Scene | None, scales: Sequence[float], plan: Plan
             raise Interrupted("interrupted; nothing was measured yet") from None
         write(goes_on(folder), measured, complete=False)
         count = sum(len(tradeoff.points) for tradeoff in measured)
-        again = f"the {count} points measured so far are in {folder.path}; run the same command again to go on"
+        again = f"the {plural(count, 'point')} measured so far: {folder.path}; run the same command again to go on"
         raise Interrupted(f"interrupted; {again}") from None
     write(goes_on(folder), tradeoffs, complete=True)
-    cells.remove()
     return tradeoffs

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -14,7 +13,7 @@ from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.views import choose_views, with_times
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.errors import SettingsError, plural
+from mipmap_plugin.errors import SettingsError, plural, warn
 from mipmap_plugin.evaluation.measure import RESIZED, resized_base, supersampled, views_seen
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.other_scene import of_another_scene, of_another_size
@@ -48,7 +47,7 @@ def photographs(model: Wrapped, scene: Scene, scale: float, most: int | None) ->
     Raises SettingsError if there are none, if they are too small, and if no other camera is left to adapt to.
     """
     if doubt := of_another_size(model, scene):
-        warnings.warn(doubt, stacklevel=2)
+        warn(doubt)
     judged: dict[Camera, TruthView] = {view.camera: view for view in photographed_views(model, scene)}
     train = [camera for camera in model.cameras if camera.split == "train"] or model.cameras
     views, adapt_on = list(judged), _others(train, list(judged))
@@ -59,7 +58,7 @@ def photographs(model: Wrapped, scene: Scene, scale: float, most: int | None) ->
         raise SettingsError("every camera of the checkpoint is evaluated, so that none is left to adapt to; give photographs of fewer views")
     protocol, views = PROTOCOLS["P3"], evenly(views, most)
     if doubt := of_another_scene(model, [judged[view] for view in views], scale, protocol):
-        warnings.warn(doubt, stacklevel=2)
+        warn(doubt)
     truths = {view: judged[view].truth(scale, protocol) for view in views}
     label = f"real dB, protocol P3 on {plural(len(views), 'photograph')}"
     return GroundTruth(label, views, adapt_on, lambda view, image: psnr(protocol.as_saved(image), truths[view]), protocol.shrink_by)

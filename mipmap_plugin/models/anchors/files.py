@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mipmap_plugin.errors import CheckpointError, OutputExists, SettingsError
+from mipmap_plugin.errors import CheckpointError, OutputExists, SettingsError, some_of, warn
 from mipmap_plugin.formats.atomic import new_file, sha256
 from mipmap_plugin.formats.cfg_args import cfg_args_text, format_cfg_args
 from mipmap_plugin.formats.ply import read_ply
@@ -121,7 +120,7 @@ def _rounded(columns: Mapping[str, np.ndarray], carried: tuple[str, ...], path: 
     if not names:
         return []
     note = f"integers above {1 << np.finfo(np.float32).nmant + 1:,} in {', '.join(names)} are rounded to float32; number them from 0 if they matter"
-    warnings.warn(f"{path}: {note}", stacklevel=2)
+    warn(f"{path}: {note}")
     return [note]
 
 
@@ -169,5 +168,5 @@ def _checked(parameters: dict[str, Tensor], carried: tuple[str, ...], weights: W
     if valid.all():
         return parameters, []
     if not valid.any():
-        raise CheckpointError(f"{where}: none of its {len(valid):,} anchors is finite; the training or the export failed")
-    return {name: tensor[valid] for name, tensor in parameters.items()}, [dropped(~valid, "anchors", "not finite", where)]
+        raise CheckpointError(f"{where}: {some_of(0, len(valid), 'anchor', 'are')} finite; the training or the export failed")
+    return {name: tensor[valid] for name, tensor in parameters.items()}, [dropped(~valid, "anchor", "not finite", where)]

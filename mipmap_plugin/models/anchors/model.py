@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera, every_nth
 from mipmap_plugin.effects import Effect
-from mipmap_plugin.errors import ShapeError
+from mipmap_plugin.errors import ShapeError, plural
 from mipmap_plugin.formats.atomic import together
 from mipmap_plugin.formats.ply import write_ply
 from mipmap_plugin.formats.splat_transform import refuse_ending
@@ -206,14 +206,15 @@ class AnchorModel(ABC):
         return decode(self._anchors(slice(None), None), self._weights, self._inputs, camera)
 
     def _layout_notes(self) -> list[str]:
-        notes = [f"{len(self):,} anchors with {self._parameters['offsets'].shape[1]} splats each, which are decoded for each camera"]
+        each = plural(self._parameters["offsets"].shape[1], "splat")
+        notes = [f"{plural(len(self), 'anchor')} with {each} each, which are decoded for each camera"]
         for name, extra in {"distance": "the distance of the camera", "level": "the anchor's level"}.items():
             if takers := [network for network, taken in self._inputs.items() if name in taken]:
                 notes.append(f"{extra} goes into {', '.join(takers)}")
         if "appearance" in self._weights:
             count = len(self._weights["appearance"][EMBEDDING])
             upstream = "its project gives the n-th test view the appearance of the n-th training view (evaluate --appearance upstream)"
-            notes.append(f"it has an appearance for each of {count} training views; any other camera gets their mean, where {upstream}")
+            notes.append(f"it has an appearance for each of {plural(count, 'training view')}; any other camera gets their mean, where {upstream}")
         return notes
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> AnchorModel:

@@ -1,0 +1,96 @@
+"""What an output was made from is removed with its appearance: killed before any call, a command leaves the one or the other, and can be repeated."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from itertools import product
+
+import kill_points
+import pytest
+from test_kill_points import numbers
+
+from mipmap_plugin.errors import OutputError
+from mipmap_plugin.formats import staging
+from mipmap_plugin.formats.atomic import new_file, new_folder, settled, together
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+
+
+def write(out, text, files):
+    """An output of one file, of two, or of a folder, from its state and a folder of unfinished work beside it."""
+    with together(out, [out.with_name("out.resume"), out.with_name("out.tiles")]):
+        if files == 0:
+            with new_folder(out, overwrite=True) as folder:
+                (folder / "part").write_text(text)
+        for name in ("out", "out.json")[:files]:
+            with new_file(out.with_name(name), overwrite=True) as temporary:
+                temporary.write_text(text)
+
+
+def begin(folder, files, replaced):
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    if replaced:
+        write(folder / "out", "old", files)
+    (folder / "out.resume").write_text("state")
+    (folder / "out.tiles").mkdir()
+    for name in "abc":
+        (folder / "out.tiles" / name).write_text(name)
+
+
+def text_of(out):
+    place = out / "part" if out.is_dir() else out
+    return place.read_text() if place.exists() else None
+
+
+CASES = [pytest.param(0, True, True, id="folder"), pytest.param(2, True, True, id="two files")]
+SLOW = [pytest.param(*case, marks=pytest.mark.slow) for case in product((0, 1, 2), (False, True), (False, True))]
+
+
+@pytest.mark.parametrize(("files", "replaced", "exchanges"), CASES + SLOW)
+def test_what_is_spent_is_there_until_the_output_is_and_not_after(tmp_path, monkeypatch, files, replaced, exchanges, request):
+    if not exchanges:
+        monkeypatch.setattr(staging, "exchange", lambda one, other: False)
+    out = tmp_path / "place" / "out"
+    kept, seen = {"out.resume", "out.tiles"}, set()
+    for number in numbers(request):
+        begin(out.parent, files, replaced)
+        if not kill_points.killed(number, lambda: write(out, "new", files)):
+            break
+        text = text_of(settled(out))
+        left = {path.name for path in out.parent.iterdir()} & kept
+        assert (text, left) in [("old" if replaced else None, kept), ("new", set())]
+        assert len(list((out.parent / "out.tiles").glob("*"))) in (0, 3)  # whole, or gone
+        assert not [path.name for path in out.parent.iterdir() if path.name.startswith(".")]
+        seen.add(text)
+    assert len(seen) == 2 and text_of(out) == "new" and not {path.name for path in out.parent.iterdir()} & kept
+
+
+def test_what_another_run_has_put_there_since_is_not_taken_for_spent(tmp_path, monkeypatch):
+    begin(tmp_path / "place", 1, replaced=False)
+    out, state = tmp_path / "place" / "out", tmp_path / "place" / "out.resume"
+    with monkeypatch.context() as killed:
+        killed.setattr(staging, "_remove", lambda *_: None)
+        killed.setattr(staging.Staging, "close", lambda self: os.close(self._lock))
+        write(out, "new", 1)
+    new = state.with_name("other")  # a file of its own, so that its inode is another
+    new.write_text("of another run")
+    new.rename(state)
+    assert text_of(settled(out)) == "new" and state.read_text() == "of another run"
+
+
+def test_what_would_be_spent_stays_where_the_output_around_it_fails(tmp_path):
+    begin(tmp_path / "place", 1, replaced=False)
+    out = tmp_path / "place" / "out"
+    with pytest.raises(OutputError, match="no page"), together(out):
+        write(out, "new", 1)
+        raise OutputError("no page")
+    assert {path.name for path in out.parent.iterdir()} == {"out.resume", "out.tiles"}
+
+
+def test_a_folder_around_the_output_is_not_spent(tmp_path):
+    out = tmp_path / "state" / "out"
+    with together(out, [tmp_path / "state"]), new_file(out, overwrite=False) as temporary:
+        temporary.write_text("new")
+    assert text_of(out) == "new"

@@ -1,0 +1,77 @@
+"""Records and methods of the API given tensors, arrays and numbers of the wrong kind: one error of ours, in place of torch's or Python's."""
+
+import math
+
+import numpy as np
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin import Camera, Effects, Gaussians, load_model, wrap_model
+from mipmap_plugin.errors import SettingsError, ShapeError
+from mipmap_plugin.render_settings import RenderSettings
+
+VIEW = {"width": 8, "height": 6, "fx": 5.0, "fy": 5.0, "cx": 4.0, "cy": 3.0, "viewmat": torch.eye(4)}
+
+
+@pytest.mark.parametrize(("name", "value"), [
+    ("sh_degree", "x"), ("sh_degree", 1.5), ("sh_degree", -1), ("screen_filter", 3), ("eps2d", "0.3"), ("eps2d", math.nan), ("eps2d", torch.ones(2)),
+    ("background", 1), ("background", (0, 0, math.nan)), ("background", "abc"), ("supersampling", 2.0), ("supersampling", None),
+    ("near_plane", "x"), ("settings", None), ("outputs", 3), ("outputs", "depth"), ("exposure", []),
+])  # fmt: skip
+def test_effects_of_the_wrong_kind_are_named(name, value):
+    with pytest.raises(SettingsError, match=name):
+        Effects(**{name: value})
+
+
+@pytest.mark.parametrize("name", ["radial", "bucketed", "fades", "fits_picture"])
+def test_switches_of_render_settings_are_true_or_false(name):
+    with pytest.raises(SettingsError, match=f"render settings: {name} must be True or False, got 'yes'"):
+        RenderSettings(**{name: "yes"})
+
+
+def test_a_sparse_pose_is_one():
+    assert torch.equal(Camera(**VIEW | {"viewmat": torch.eye(4).to_sparse()}).viewmat, torch.eye(4, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("given", [torch.ones(3, 3), np.ones((2, 4, 4)), "x", torch.ones(2).to_sparse(), torch.eye(4, device="meta")])
+def test_what_is_no_pose_is_named(given):
+    for make in (lambda: Camera(**VIEW | {"viewmat": given}), lambda: Camera.of_matrices(given, np.eye(3), 8, 6)):
+        with pytest.raises(ShapeError, match=r"^viewmat: expected"):
+            make()
+    with pytest.raises(ShapeError, match=r"^c2w: expected"):
+        Camera.of_opengl(given, np.eye(3), 8, 6)
+
+
+@pytest.mark.parametrize(("name", "value"), [("fx", torch.tensor(1 + 1j)), ("width", -1), ("cx", math.nan), ("split", np.ones(3))])
+def test_what_is_no_number_of_a_camera_is_named(name, value):
+    with pytest.raises(SettingsError, match="camera"):
+        Camera(**VIEW | {name: value})
+
+
+@pytest.mark.parametrize(("change", "sentence"), [
+    (lambda tensor: tensor.int(), "floating-point"),
+    (lambda tensor: tensor.to_sparse(), "dense"),
+    (lambda tensor: tensor.numpy(), "expected a torch tensor, got ndarray"),
+])  # fmt: skip
+def test_splats_of_other_kinds_of_tensors_are_named(change, sentence):
+    with pytest.raises(ShapeError, match=sentence):
+        Gaussians(**{name: change(tensor) for name, tensor in tiny.gaussians(3).tensors().items()})
+
+
+@pytest.mark.parametrize(("call", "sentence"), [
+    (lambda base: base.effects(supersampling="2"), "supersampling"),
+    (lambda base: base.render(base.views()[0], supersampling=np.ones(3)), "supersampling"),
+    (lambda base: base.render(base.views()[0], scale=torch.tensor(1 + 1j)), "^scale"),
+    (lambda base: base.adapt(0.5, cameras=torch.tensor(1.0)), "^cameras must be of the type"),
+    (lambda base: base.place(3), "^images must be the path"),
+    (lambda base: base.refuse_output(3, overwrite=False), "^path must be a text"),
+    (lambda base: base.refuse_undrawn([3]), "^cameras must be of the type"),
+    (lambda base: base.refuse_undrawn(scale="x"), "^scale"),
+    (lambda base: wrap_model(base.model, threads=np.ones(2)), "^threads"),
+    (lambda base: load_model(np.ones(3)), "path"),
+])  # fmt: skip
+def test_arguments_of_the_wrong_kind_are_named(call, sentence):
+    base = wrap_model(tiny.model(5), cameras=tiny.cameras(2, width=8, height=6), backend="reference")
+    with pytest.raises(SettingsError, match=sentence):
+        call(base)
