@@ -1,4 +1,4 @@
-"""Shared by the GPU backends: requirement checks, and the preparation of splats for other projects' rasterizers."""
+"""Requirement checks that backends share, and the preparation of splats for other projects' rasterizers."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from torch import Tensor
 from mipmap_plugin.backends.base import Backend, Needs
 from mipmap_plugin.backends.reference import finite_rows
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.rotations import unit
@@ -21,14 +22,13 @@ class CachedCheck:
     def __init__(self, backend: Backend) -> None:
         self._backend, self._served = backend, set[Needs]()
 
-    def require(self, needs: Needs) -> None:
-        """Raise BackendUnavailable, an ImportError, with every reason why the backend cannot serve `needs`."""
-        if needs in self._served:
-            return
-        reasons = self._backend.lacking(needs)
-        if reasons:
-            raise BackendUnavailable(f"backend {self._backend.name!r} cannot do this: {'; '.join(reasons)}")
-        self._served.add(needs)
+    def require(self, gaussians: Gaussians, effects: Effects) -> None:
+        """Raise BackendUnavailable, an ImportError, with every reason why the backend cannot draw and differentiate `gaussians`."""
+        needs = Needs.of(gaussians, effects, gradients=True)
+        if needs not in self._served:
+            if reasons := self._backend.lacking(needs):
+                raise BackendUnavailable(f"backend {self._backend.name!r} cannot do this: {'; '.join(reasons)}")
+            self._served.add(needs)
 
 
 def at_the_origin(camera: Camera) -> Camera:

@@ -61,7 +61,7 @@ class GsplatBackend:
 
         The host synchronizes with the GPU twice: here for whether all splats are finite, in gsplat for the number of (splat, tile) pairs.
         """
-        self._check.require(Needs.of(gaussians, effects, gradients=True))
+        self._check.require(gaussians, effects)
         if reason := unloadable():
             raise BackendUnavailable(f"backend 'gsplat' cannot do this: {reason}")
         gaussians = finite_splats(gaussians)

@@ -72,7 +72,7 @@ class InriaBackend:
 
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         """The view of `camera`. Raises BackendUnavailable, an ImportError, if this backend cannot serve the request."""
-        self._check.require(Needs.of(gaussians, effects, gradients=True))
+        self._check.require(gaussians, effects)
         gaussians = finite_splats(gaussians)
         if len(gaussians) == 0:
             return ReferenceBackend().render(gaussians, camera, effects)

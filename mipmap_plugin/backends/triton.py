@@ -108,7 +108,7 @@ class TritonBackend:
     def _prepared(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[tuple[tuple[Tensor | None, ...], list[Shot]]]:
         """The tensors of the splats, packed as a viewer's file does, and the views that are drawn of them at once. Raises BackendUnavailable."""
         for _, effects in shots:
-            self._check.require(Needs.of(gaussians, effects, gradients=True))
+            self._check.require(gaussians, effects)
         from mipmap_plugin.backends.triton_kernels.views import Shot
 
         ranks = ranks_of_views(gaussians, [(camera, effects.settings) for camera, effects in shots])
