@@ -100,10 +100,8 @@ class CpuBackend:
     def _prepared(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[tuple[Any, ...], Any]:
         """The tensors of the splats, packed as a viewer's file does, and their ranks, where they are sorted by buckets. Raises BackendUnavailable."""
         self._check.require(gaussians, effects)
-        packing = effects.settings.packing
-        g = gaussians if packing is None else packed(gaussians, camera, packing)
-        ranks = _ranks(gaussians, camera, effects.settings)
-        return (g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances), ranks
+        g = packed(gaussians, camera, effects.settings.packing)
+        return (g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances), _ranks(gaussians, camera, effects.settings)
 
 
 def nearest_along(means: Tensor, *further: Tensor, reach: int, limits: tuple[float, float]) -> tuple[Tensor, Tensor] | None:

@@ -31,6 +31,8 @@ from mipmap_plugin.splatting.projection import Projected, project
 from mipmap_plugin.splatting.surfels import Surfels, surfels
 from mipmap_plugin.splatting.window import WindowIntegral
 
+Footprints = Footprint | PixelIntegral | Surfels
+
 
 class ReferenceBackend:
     """The backend that all others are compared with."""
@@ -50,8 +52,7 @@ class ReferenceBackend:
         if settings.linear_light is not None:
             return in_linear_light(self.render, gaussians, camera, effects)
         ranks = buckets.ranks_for(settings, gaussians, camera)
-        if settings.packing is not None:
-            gaussians = packed(gaussians, camera, settings.packing)
+        gaussians = packed(gaussians, camera, settings.packing)
         with torch.no_grad():
             rows = drawn_rows(gaussians, camera, effects, ranks)
         gaussians = gaussians[rows]
@@ -99,7 +100,7 @@ def finite_rows(gaussians: Gaussians) -> Tensor:
 
 
 @torch.no_grad()
-def least_alpha(footprints: Footprint | PixelIntegral | Surfels, settings: RenderSettings) -> Tensor:
+def least_alpha(footprints: Footprints, settings: RenderSettings) -> Tensor:
     """The alpha below which each splat is not drawn, [N]: `min_alpha`, or exp(-r²/2) times its peak if it is cut at a radius of r.
 
     A splat that fades is not cut: its alpha is 0 at that radius.
@@ -111,11 +112,9 @@ def least_alpha(footprints: Footprint | PixelIntegral | Surfels, settings: Rende
     return (footprints.alpha(parameters, zero, zero) * math.exp(-(settings.radius**2) / 2)).clamp_min(settings.min_alpha)
 
 
-def _footprints(
-    gaussians: Gaussians, camera: Camera, effects: Effects, dtype: torch.dtype
-) -> tuple[Projected, Footprint | PixelIntegral | Surfels]:
+def _footprints(gaussians: Gaussians, camera: Camera, effects: Effects, dtype: torch.dtype) -> tuple[Projected, Footprints]:
     """The projection in the dtype of `gaussians`, and the footprints in `dtype`."""
-    footprints: Footprint | PixelIntegral | Surfels
+    footprints: Footprints
     if effects.screen_filter == SURFEL:
         projected, footprints = surfels(gaussians, camera, effects)
     else:

@@ -111,13 +111,10 @@ class TritonBackend:
             self._check.require(gaussians, effects)
         from mipmap_plugin.backends.triton_kernels.views import Shot
 
-        ranks = ranks_of_views(gaussians, [(camera, effects.settings) for camera, effects in shots])
-        ranked = [Shot(*shot, own) for shot, own in zip(shots, ranks, strict=True)]
+        ranked = [Shot(*shot, ranks) for shot, ranks in zip(shots, ranks_of_views(gaussians, shots), strict=True)]
         if all(effects.settings.packing is None for _, effects in shots):
             return [(_tensors(gaussians), ranked)]
-        packings = [effects.settings.packing for _, effects in shots]
-        splats = [gaussians if packing is None else packed(gaussians, shot.camera, packing) for shot, packing in zip(ranked, packings, strict=True)]
-        return [(_tensors(own), [shot]) for own, shot in zip(splats, ranked, strict=True)]
+        return [(_tensors(packed(gaussians, shot.camera, shot.effects.settings.packing)), [shot]) for shot in ranked]
 
     def compile_ahead(self, gaussians: Gaussians, effects: Sequence[Effects], calls: Calls) -> None:
         """Compile on all threads what draws such splats with any of the effects."""

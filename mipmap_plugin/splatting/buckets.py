@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import EvenBuckets, RenderSettings
 from mipmap_plugin.splatting.rotations import rotations
@@ -109,8 +110,9 @@ def ranks_for(settings: RenderSettings, gaussians: Gaussians, camera: Camera) ->
     return even_ranks(gaussians, camera, settings.even_buckets) if settings.even_buckets else None
 
 
-def ranks_of_views(gaussians: Gaussians, views: Sequence[tuple[Camera, RenderSettings]]) -> list[Tensor | None]:
+def ranks_of_views(gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[Tensor | None]:
     """The same for several views."""
+    views = [(camera, effects.settings) for camera, effects in shots]
     bucketed = [camera for camera, settings in views if settings.bucketed]
     found = iter(view_ranks(gaussians, bucketed) if bucketed else [])
     return [next(found) if settings.bucketed else ranks_for(settings, gaussians, camera) for camera, settings in views]

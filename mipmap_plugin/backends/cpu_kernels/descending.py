@@ -40,12 +40,12 @@ def descend(splats: SplatArrays, views: Sequence[tuple[Drawing, np.ndarray]], st
     threads.share(move, count, of_rows=True)
 
 
-def activated(raw: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
-    """The activated splats of raw parameters, by the names of `Gaussians`. They share means and coefficients with these."""
+def activated(raw: Mapping[str, Tensor]) -> SplatArrays:
+    """The activated splats of raw parameters. They share means and coefficients with these."""
     given = _arrays(raw)
     splats = given._replace(quats=np.empty_like(given.quats), scales=np.empty_like(given.scales), opacities=np.empty_like(given.opacities))
     team(len(given.means)).share(adam.activate_rows, len(given.means), given, splats, of_rows=True)
-    return {name: array for name, array in splats._asdict().items() if name != "covariances"}
+    return splats
 
 
 class _Room:

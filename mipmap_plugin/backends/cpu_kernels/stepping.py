@@ -11,7 +11,6 @@ from torch import Tensor
 
 from mipmap_plugin.backends.base import AdamStep, Rendered
 from mipmap_plugin.backends.cpu_kernels import ahead, descending, drawing
-from mipmap_plugin.backends.cpu_kernels.records import SplatArrays
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
@@ -28,9 +27,8 @@ class CpuStepper:
     """See `base.Stepper`. It keeps the activated splats from step to step: the kernel that moves a row activates it anew."""
 
     def __init__(self, raw: Mapping[str, Tensor], require: Require, ranks: Ranks) -> None:
-        activated, self._require, self._ranks = descending.activated(raw), require, ranks
-        self._gaussians = Gaussians(**{name: torch.from_numpy(array) for name, array in activated.items()})
-        self._splats = SplatArrays(**activated, covariances=np.empty((0, 3, 3), np.float32))
+        self._splats, self._require, self._ranks = descending.activated(raw), require, ranks
+        self._gaussians = Gaussians(*(torch.from_numpy(array) for array in self._splats[:-1]))  # without covariances
         self._projected: dict[tuple[int, Camera], drawing.Projection] = {}  # the views of a step, by their numbers
         self._drawn: dict[int, drawing.Drawing] = {}  # and what is drawn of them
         self._tables: dict[int, np.ndarray] = {}  # and their gradient tables
