@@ -21,9 +21,8 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable, brief, install
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.process.torch_modes import opaque
-from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.screen_filters import INTEGRATED
-from mipmap_plugin.splatting.buckets import ranks_for
+from mipmap_plugin.splatting.buckets import ranks_of_views
 from mipmap_plugin.splatting.packing import packed
 
 NO_NUMBA = f"it needs numba, which some Pythons and processors have no wheels of; where there are, {install('cpu')}"
@@ -101,7 +100,7 @@ class CpuBackend:
         """The tensors of the splats, packed as a viewer's file does, and their ranks, where they are sorted by buckets. Raises BackendUnavailable."""
         self._check.require(gaussians, effects)
         g = packed(gaussians, camera, effects.settings.packing)
-        return (g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances), _ranks(gaussians, camera, effects.settings)
+        return (g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances), _ranks(gaussians, camera, effects)
 
 
 def nearest_along(means: Tensor, *further: Tensor, reach: int, limits: tuple[float, float]) -> tuple[Tensor, Tensor] | None:
@@ -140,10 +139,10 @@ def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().contiguous().numpy()
 
 
-def _ranks(gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> Any:
-    """`splatting.buckets.ranks_for`; compiled for PlayCanvas's, in whose order many steps of a portable file are drawn."""
-    if not settings.bucketed:
-        found = ranks_for(settings, gaussians, camera)
+def _ranks(gaussians: Gaussians, camera: Camera, effects: Effects) -> Any:
+    """`splatting.buckets.ranks_of_views`, of one; compiled for PlayCanvas's, in whose order many steps of a portable file are drawn."""
+    if not effects.settings.bucketed:
+        [found] = ranks_of_views(gaussians, [(camera, effects)])
         return None if found is None else found.numpy()
     return _kernels("bucketing").ranks(_array(gaussians.means), _array(gaussians.scales), camera)
 

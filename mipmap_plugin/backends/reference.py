@@ -20,7 +20,7 @@ from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.screen_filters import SCREEN_FILTERS
-from mipmap_plugin.splatting import buckets
+from mipmap_plugin.splatting.buckets import ranks_of_views
 from mipmap_plugin.splatting.compositing import SortedSplats, composite, independent
 from mipmap_plugin.splatting.filters import Footprint, footprint
 from mipmap_plugin.splatting.harmonics import colors
@@ -51,7 +51,7 @@ class ReferenceBackend:
         settings = effects.settings
         if settings.linear_light is not None:
             return in_linear_light(self.render, gaussians, camera, effects)
-        ranks = buckets.ranks_for(settings, gaussians, camera)
+        [ranks] = ranks_of_views(gaussians, [(camera, effects)])
         gaussians = packed(gaussians, camera, settings.packing)
         with torch.no_grad():
             rows = drawn_rows(gaussians, camera, effects, ranks)
@@ -72,8 +72,8 @@ class ReferenceBackend:
         return Rendered(image, 1 - transmittance)
 
 
-def drawn_rows(gaussians: Gaussians, camera: Camera, effects: Effects, ranks: Tensor | None = None) -> Tensor:
-    """Indices of the splats that can touch the image, front to back; in ascending order of `ranks` [N], if given.
+def drawn_rows(gaussians: Gaussians, camera: Camera, effects: Effects, ranks: Tensor | None) -> Tensor:
+    """Indices of the splats that can touch the image, front to back; in ascending order of `ranks` [N], or of their depths.
 
     Computed first and without gradients, so that splats that are not drawn, even NaN, are not part of any gradient.
     """

@@ -14,13 +14,12 @@ from mipmap_plugin.backends.cpu_kernels import ahead, descending, drawing
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.render_settings import RenderSettings
 
 # Raises BackendUnavailable for splats and effects that cannot be drawn.
 Require = Callable[[Gaussians, Effects], None]
 
-# Splats, a camera and settings -> the splats' ranks, by which they are sorted; None where that is by their depths.
-Ranks = Callable[[Gaussians, Camera, RenderSettings], Any]
+# Splats, a camera and effects -> the splats' ranks, by which they are sorted; None where that is by their depths.
+Ranks = Callable[[Gaussians, Camera, Effects], Any]
 
 
 class CpuStepper:
@@ -41,7 +40,7 @@ class CpuStepper:
     def _shot(self, camera: Camera, effects: Effects) -> drawing.Shot:
         self._require(self._gaussians, effects)
         ahead.start(False, effects)  # the backward pass is compiled while the forward pass is
-        return drawing.Shot(camera, effects, self._ranks(self._gaussians, camera, effects.settings))
+        return drawing.Shot(camera, effects, self._ranks(self._gaussians, camera, effects))
 
     def render(self, number: int, camera: Camera, effects: Effects) -> Rendered:
         projected = self._projected.pop((number, camera), None)
