@@ -27,7 +27,7 @@ from mipmap_plugin.splatting.harmonics import colors
 from mipmap_plugin.splatting.packing import packed, round_to
 from mipmap_plugin.splatting.pixel_integral import PixelIntegral
 from mipmap_plugin.splatting.precision import exact
-from mipmap_plugin.splatting.projection import Projected, project
+from mipmap_plugin.splatting.projection import project
 from mipmap_plugin.splatting.surfels import Surfels, surfels
 from mipmap_plugin.splatting.window import WindowIntegral
 
@@ -57,7 +57,7 @@ class ReferenceBackend:
             rows = drawn_rows(gaussians, camera, effects, ranks)
         gaussians = gaussians[rows]
         wide = exact(gaussians)
-        projected, footprints = _footprints(wide, camera, effects, gaussians.means.dtype)
+        means2d, _, footprints = _footprints(wide, camera, effects, gaussians.means.dtype)
         degree = min(effects.sh_degree, gaussians.sh_degree)
         rgb = colors(gaussians.sh, wide.means, camera.center.to(wide.means), degree)
         if settings.max_color is not None:
@@ -67,7 +67,7 @@ class ReferenceBackend:
         least = least_alpha(footprints, settings)
         by_splat = independent(footprints.alpha, settings.max_alpha, settings.culls)
         alphas, memory = (footprints.alphas, footprints.MEMORY_FACTOR) if isinstance(footprints, WindowIntegral) else (by_splat, 1)
-        splats = SortedSplats(projected.means2d.to(rgb), footprints.packed(), rgb, least, alphas, memory)
+        splats = SortedSplats(means2d.to(rgb), footprints.packed(), rgb, least, alphas, memory)
         image, transmittance = composite(splats, footprints.extents(least), camera, settings, rgb.new_tensor(effects.background))
         return Rendered(image, 1 - transmittance)
 
@@ -78,16 +78,17 @@ def drawn_rows(gaussians: Gaussians, camera: Camera, effects: Effects, ranks: Te
     Computed first and without gradients, so that splats that are not drawn, even NaN, are not part of any gradient.
     """
     wide = exact(gaussians)
-    projected, footprints = _footprints(wide, camera, effects, gaussians.means.dtype)
+    means2d, depths, footprints = _footprints(wide, camera, effects, gaussians.means.dtype)
     least = least_alpha(footprints, effects.settings)
     half = footprints.extents(least)
-    low, high = projected.means2d - half, projected.means2d + half
-    inside = (high > 0).all(1) & (low < low.new_tensor([camera.width, camera.height])).all(1)
+    low, high = means2d - half, means2d + half
+    size = low.new_tensor([camera.width, camera.height])
+    inside = (high > 0).all(1) & (low < size).all(1)
     if effects.settings.frame < math.inf:
-        inside &= (2 * projected.means2d / low.new_tensor([camera.width, camera.height]) - 1).abs().amax(1) <= effects.settings.frame
-    drawn = finite_rows(gaussians) & (projected.depths > effects.near_plane) & footprints.visible(least) & inside
+        inside &= (2 * means2d / size - 1).abs().amax(1) <= effects.settings.frame
+    drawn = finite_rows(gaussians) & (depths > effects.near_plane) & footprints.visible(least) & inside
     rows = drawn.nonzero()[:, 0]
-    keys = (wide.means - camera.center.to(wide.means)).norm(dim=1) if effects.settings.radial else projected.depths
+    keys = (wide.means - camera.center.to(wide.means)).norm(dim=1) if effects.settings.radial else depths
     keys = keys if ranks is None else ranks
     return rows[keys[rows].argsort(stable=True)]
 
@@ -112,14 +113,14 @@ def least_alpha(footprints: Footprints, settings: RenderSettings) -> Tensor:
     return (footprints.alpha(parameters, zero, zero) * math.exp(-(settings.radius**2) / 2)).clamp_min(settings.min_alpha)
 
 
-def _footprints(gaussians: Gaussians, camera: Camera, effects: Effects, dtype: torch.dtype) -> tuple[Projected, Footprints]:
-    """The projection in the dtype of `gaussians`, and the footprints in `dtype`."""
+def _footprints(gaussians: Gaussians, camera: Camera, effects: Effects, dtype: torch.dtype) -> tuple[Tensor, Tensor, Footprints]:
+    """Means on the image, [N, 2] px, and depths, [N], in the dtype of `gaussians`; and the footprints in `dtype`."""
     footprints: Footprints
     if effects.screen_filter == SURFEL:
-        projected, footprints = surfels(gaussians, camera, effects)
+        means2d, depths, footprints = surfels(gaussians, camera, effects)
     else:
         projected = project(gaussians, camera, effects.near_plane, effects.settings)
-        most = effects.settings.max_variance(camera.width, camera.height)
+        means2d, depths, most = projected.means2d, projected.depths, effects.settings.max_variance(camera.width, camera.height)
         footprints = footprint(projected, gaussians.opacities, effects.screen_filter, effects.eps2d, effects.settings, most)
     rounded: dict[str, Any] = {name: value.to(dtype) for name, value in vars(footprints).items() if isinstance(value, Tensor)}
-    return projected, replace(footprints, **rounded)
+    return means2d, depths, replace(footprints, **rounded)
