@@ -29,6 +29,9 @@ NO_NUMBA = f"it needs numba, which some Pythons and processors have no wheels of
 NO_FOLDER = "numba has no writable folder for compiled code; set the environment variable NUMBA_CACHE_DIR to one"
 REINSTALL = "install it anew, where there are wheels by pip install --force-reinstall numba, which brings all that it needs"
 
+# Settings that kernels of screen filters that integrate do not read.
+CUT_OFFS = {"min_alpha", "min_transmittance", "radius", "frame"}
+
 # The position of the coefficients among the arguments of `_Draw.forward`.
 SH = 5
 
@@ -52,10 +55,9 @@ class CpuBackend:
 
     def lacking(self, needs: Needs) -> list[str]:
         """The reasons why this backend cannot serve `needs`; empty if it can."""
-        supported = {"max_color", "color_steps", "radial", "bucketed", "even_buckets", "frozen_beyond", "frozen_by_width", "packing"}
-        changed = needs.screen_filter in INTEGRATED and set(needs.settings.changed()) - supported
-        unsupported = [f"it draws the screen filter {needs.screen_filter} with the usual cut-offs only"] if changed else []
-        return self.capabilities.lacking(needs) + unsupported or missing()
+        cut_off = needs.screen_filter in INTEGRATED and CUT_OFFS & set(needs.settings.changed())
+        unsupported = [f"it draws the screen filter {needs.screen_filter} with the usual cut-offs only"] if cut_off else []
+        return self.capabilities.lacking(needs) + unsupported or list(missing())
 
     @opaque
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
