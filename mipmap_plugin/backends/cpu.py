@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Calls, Capabilities, Needs, Rendered, Stepper
-from mipmap_plugin.backends.external import CachedCheck
+from mipmap_plugin.backends.base import API_VERSION, SETTINGS, CachedCheck, Calls, Capabilities, Needs, Rendered, Stepper
 from mipmap_plugin.backends.linear_light import in_linear_light
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects

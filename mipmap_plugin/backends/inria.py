@@ -26,8 +26,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.external import NO_CUDA, CachedCheck, at_the_origin, finite_splats, normalized
+from mipmap_plugin.backends.base import API_VERSION, CachedCheck, Capabilities, Needs, Rendered
+from mipmap_plugin.backends.external import NO_CUDA, at_the_origin, finite_splats, normalized
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects

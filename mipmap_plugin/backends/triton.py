@@ -26,8 +26,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Calls, Capabilities, Needs, Rendered, Stepper
-from mipmap_plugin.backends.external import NO_CUDA, CachedCheck
+from mipmap_plugin.backends.base import API_VERSION, SETTINGS, CachedCheck, Calls, Capabilities, Needs, Rendered, Stepper
+from mipmap_plugin.backends.external import NO_CUDA
 from mipmap_plugin.backends.linear_light import in_linear_light
 from mipmap_plugin.camera import ONE_PIXEL, Camera
 from mipmap_plugin.effects import Effects
