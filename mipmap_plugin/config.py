@@ -99,7 +99,7 @@ class AdaptConfig(BaseModel):
         default=0.0,
         ge=0,
         le=1,
-        description="Zoom-in: from 0 (highest PSNR) to 1 (splats of the base's size, but more opaque); the least tried below x2 without steps.",
+        description="Zoom-in: from 0 (wider splats) to 1 (thin ones more opaque instead, if they can be); the least tried below x2 without steps.",
     )
     merge_to: float = Field(default=1.0, gt=0, le=1, description="Fraction of the splats to keep when similar splats that share pixels are merged.")
     merging_costs: float = Field(

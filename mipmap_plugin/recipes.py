@@ -51,10 +51,6 @@ LONGEST = 80
 # What a run ends by at the user's wish: then `most_draws` does not, and there are steps at any zoom.
 ENDS = ("steps", "time_budget_s", "target_db")
 
-# A time budget mostly leaves too few steps to make a crisp start as good as a soft one: with half of the crispness photographs of lego and chair gain
-# 0.7 to 1.1 dB in a second, 0.3 to 0.6 in two, and lose none in four, at x2 and x4; captures at x2 gain 1 to 5 in two to six.
-CRISPNESS_IN_BUDGET = 0.5
-
 # In a time budget with room for more, 720 steps gain 0.6 dB on lego at x1/4, and 1440 1.2 dB.
 DEFAULT_OUT = dict(
     steps=360, most_steps=2500, most_draws=MOST_DRAWS, loss="psnr", decay=0.02, betas=(0.9, 0.95), nesterov=True, truth_oversampling=4,
@@ -70,7 +66,7 @@ THOROUGH_OUT = dict(
 # Without the steps at x1, one view a step is too little to learn another way to draw, where each view shows few of the splats: for spark at x2 a
 # board that a tenth of the views shows gains 5 dB by 90 of them, 8 by 180, 11 by 360. Objects gain nothing, and take longer by each.
 DEFAULT_IN = dict(
-    conversion_steps=180, steps=200, crispness=0.5, compare_at="base", resize="fitting", patience=2, check_every=25, prune_every=1000, decay=0.3,
+    conversion_steps=180, steps=200, crispness=0.75, compare_at="base", resize="fitting", patience=2, check_every=25, prune_every=1000, decay=0.3,
     least_zoom_in=LEAST_ZOOM_IN, rates=LearningRates(opacities=0.02, networks=5e-4),
 )  # fmt: skip
 DEFAULT_UPSAMPLED = dict(
@@ -102,7 +98,7 @@ def paper(scale: float, network: bool) -> dict[str, Any]:
 
 def instant(scale: float, network: bool) -> dict[str, Any]:
     """The closed form alone, without optimization: seconds."""
-    return dict(steps=0, resize="fitting") if scale <= 1 else dict(steps=0)
+    return dict(steps=0, resize="fitting") if scale <= 1 else dict(steps=0, crispness=0.5)
 
 
 RECIPES = Registry("mipmap_plugin.recipes", {name: f"mipmap_plugin.recipes:{name}" for name in ("default", "thorough", "paper", "instant")})
@@ -139,8 +135,6 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
         asked = all(each["loc"][0] in overrides for each in error.errors())
         told = dict.fromkeys(_told(each, given) for each in error.errors())  # of a pair, whose parts may both be wrong, once
         raise SettingsError(f"{'' if asked else f'recipe {name}: '}{'; '.join(told)}") from None
-    if config.time_budget_s is not None and "crispness" not in overrides:
-        config = config.model_copy(update={"crispness": CRISPNESS_IN_BUDGET * config.crispness})
     if config.band != (1, 1) and scale * config.band[1] > HIGHEST:
         raise SettingsError(f"band: x{scale:g} would be shown up to x{scale * config.band[1]:g}, but a band ends at the base's scale, x1")
     return config

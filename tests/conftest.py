@@ -1,5 +1,6 @@
 """What several test files need: real data that lies beside the repository, where there is any."""
 
+import math
 import signal
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import torch
 
 from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS
 from mipmap_plugin.backends import BACKENDS
+from mipmap_plugin.levels.ladder import NOT_BETTER
 from mipmap_plugin.models.families import FAMILIES
 from mipmap_plugin.process.garbage import leave_loaded, uncollected
 from mipmap_plugin.recipes import RECIPES
@@ -79,7 +81,9 @@ def few_views():
 
 @pytest.fixture
 def brief_ladders(monkeypatch):
-    """Levels by zoom are compared in one view and at few zooms: for tests of a ladder whose dB do not matter."""
+    """Levels by zoom are compared in one view and at few zooms, and kept unless they hold the base: for tests of a ladder whose dB do not matter."""
+    monkeypatch.setattr("mipmap_plugin.levels.ladder.MOST_LOST", math.inf)
+    monkeypatch.setattr("mipmap_plugin.levels.ladder._no_use", lambda level, *_: NOT_BETTER if level.adapted.report.holds_base() else None)
     monkeypatch.setattr("mipmap_plugin.levels.yardstick.VIEWS", 1)
     monkeypatch.setattr("mipmap_plugin.levels.switching.FIRST_STEP", 2.0)
     monkeypatch.setattr("mipmap_plugin.levels.switching.SECOND_STEP", 2.0)

@@ -75,6 +75,6 @@ def draw(splats: Gaussians, shs, colors_precomp, settings):
     least = torch.full_like(splats.opacities, MIN_ALPHA)
     rows = (footprints.visible(least) & (p.depths > NEAR)).nonzero()[:, 0]
     rows = rows[p.depths[rows].argsort(stable=True)]
-    chosen = SortedSplats(p.means2d[rows], footprints.packed()[rows], rgb[rows], least[rows], independent(footprints.alpha))
-    color, transmittance = composite(chosen, footprints.extents(least)[rows], camera, USUAL)
-    return (color + transmittance[..., None] * settings.bg).permute(2, 0, 1)
+    chosen = SortedSplats(p.means2d[rows], footprints.packed()[rows], rgb[rows], least[rows], independent(footprints.alpha, USUAL.max_alpha, False))
+    color, _ = composite(chosen, footprints.extents(least)[rows], camera, USUAL, settings.bg)
+    return color.permute(2, 0, 1)

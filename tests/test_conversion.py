@@ -119,7 +119,7 @@ def test_it_brings_a_zoom_in_closer_to_the_base():
         truths = [base.render(view).image for view in tiny.cameras(3, seed=5)]
         return sum(map(psnr, halves, truths)) / 3
 
-    assert quality(steps=40) > quality(steps=40, conversion_steps=0) + 1
+    assert quality(steps=40) > quality(steps=40, conversion_steps=0) + 0.5
 
 
 @pytest.mark.parametrize("nth", [2, 6], ids=["in the conversion", "in the zoom-in"])

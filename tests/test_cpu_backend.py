@@ -15,6 +15,7 @@ import torch
 from oracle import brute_force
 from samples import camera, gaussians
 
+from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
@@ -141,6 +142,21 @@ def test_covariances_need_not_be_symmetric_to_have_their_gradient():
     expected = gradients(reference.image, reference.alpha, g)
     assert "scales" not in grads
     assert_gradients_close(grads, {name: grad for name, grad in expected.items() if name in grads})
+
+
+@needs_numba
+@pytest.mark.parametrize("screen_filter", ["analytic", "window"])
+def test_splats_that_are_integrated_are_blended_in_linear_light_too(screen_filter):
+    splats, effects = gaussians(20).to(dtype=torch.float32), Effects(1, screen_filter, settings=RenderSettings(linear_light=2.2))
+    assert BACKEND.lacking(Needs.of(splats, effects, gradients=True)) == []
+    expected = ReferenceBackend().render(splats, WIDE, effects).image
+    torch.testing.assert_close(BACKEND.render(splats, WIDE, effects).image, expected, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("cut_off", [{"min_alpha": 0.02}, {"min_transmittance": 0.1}, {"radius": 2.0}, {"frame": 0.7}], ids=str)
+def test_splats_that_are_integrated_are_drawn_with_the_usual_cut_offs_only(cut_off):
+    needs = Needs.of(gaussians(20).to(dtype=torch.float32), Effects(1, "window", settings=RenderSettings(**cut_off)), gradients=True)
+    assert BACKEND.lacking(needs) == ["it draws the screen filter window with the usual cut-offs only"]
 
 
 @needs_numba

@@ -15,13 +15,13 @@ from mipmap_plugin.backends import BACKENDS, survey
 from mipmap_plugin.backends import gsplat as module
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.conformance import CASES, check_backend
-from mipmap_plugin.backends.conformance.cases import covariances
 from mipmap_plugin.backends.external import NO_CUDA
 from mipmap_plugin.backends.gsplat import NO_GSPLAT, NOT_COMPILED, GsplatBackend, arguments
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.render_settings import RenderSettings
+from mipmap_plugin.splatting.projection import covariances_of
 from mipmap_plugin.splatting.rotations import unit
 
 gsplat = pytest.importorskip("gsplat", reason="gsplat is in the test extra")
@@ -86,7 +86,7 @@ def test_filters_that_compensate_are_gsplats_antialiased(stand_in, screen_filter
 
 def test_covariances_are_passed_on(stand_in):
     splats = gaussians(20, dtype=torch.float32)
-    splats = replace(splats, covariances=covariances(splats))
+    splats = replace(splats, covariances=covariances_of(splats))
     OnProcessor().render(splats, WIDE, Effects(1))
     assert torch.equal(stand_in.received["covars"], splats.covariances)
 

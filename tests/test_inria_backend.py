@@ -120,7 +120,7 @@ def test_the_near_plane_is_the_requested_one(package, near):
 def test_a_principal_point_far_off_comes_to_the_middle(center, left, width):
     view = camera(40, 32, cx=center)
     frame = Frame.around(view)
-    assert (frame.left, frame.camera.width, frame.camera.cx) == (left, width, center + left)
+    assert (frame.columns.start, frame.camera.width, frame.camera.cx) == (left, width, center + left)
     assert abs(frame.camera.cx - width / 2) <= max(0.5, 0.15 * width)
     image = torch.arange(width)[None].expand(32, width)
     assert frame.crop(image)[0].tolist() == list(range(left, left + 40))

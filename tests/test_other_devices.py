@@ -28,7 +28,6 @@ from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
 from mipmap_plugin.backends import gsplat, inria
 from mipmap_plugin.backends.base import Rendered
-from mipmap_plugin.backends.conformance.cases import covariances
 from mipmap_plugin.backends.cpu import nearest_along
 from mipmap_plugin.backends.guarded import Guarded
 from mipmap_plugin.cli import main
@@ -37,6 +36,7 @@ from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.evaluation.evaluate import all_rows, evaluator_of
 from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.screen_filters import USUAL_EPS2D
+from mipmap_plugin.splatting.projection import covariances_of
 
 # Few views and small ones: each operation there is many times as slow.
 VIEWS = tiny.cameras(2, width=16, height=12)
@@ -154,7 +154,7 @@ def test_photographs_and_evaluation_there(tmp_path, monkeypatch):
 def test_arguments_of_other_rasterizers_are_on_the_device(with_covariances):
     splats, view, effects = tiny.gaussians(20), tiny.cameras()[0], Effects(1, "mip", 0.1)
     if with_covariances:
-        splats = replace(splats, covariances=covariances(splats))
+        splats = replace(splats, covariances=covariances_of(splats))
     with pretended.pretending():
         there = splats.to(pretended.DEVICE)
         arguments = gsplat.arguments(there, view, effects)

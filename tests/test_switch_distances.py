@@ -53,13 +53,13 @@ def test_a_page_is_told_to_keep_the_distances():
 
 def test_levels_by_distance_are_shown_at_the_distances_that_they_were_made_for():
     made = LADDER | {"by": "distance", "lodBaseDistance": 3.0, "lodMultiplier": 1.7, "canvas": 500, "chunk_extent": 4}
-    settings = viewer_settings(made, APPROACH, 1000)
+    settings = viewer_settings(made, None, 1000)
     assert (settings["lodBaseDistance"], settings["lodMultiplier"]) == (6.0, 1.7)
 
 
 def test_what_playcanvas_takes_for_levels_by_distance_of_a_scene_in_small_units_is_what_is_written():
     made = LADDER | {"by": "distance", "lodBaseDistance": 0.05, "lodMultiplier": 1.19, "canvas": 1000}
-    settings = viewer_settings(made | {"base_pixel": 0.01 * 0.05 / distances(LADDER, 1000)[0]}, APPROACH, 1000)
+    settings = viewer_settings(made | {"base_pixel": 0.01 * 0.05 / distances(LADDER, 1000)[0]}, None, 1000)
     assert (settings["lodBaseDistance"], settings["lodMultiplier"]) == (0.1, 1.2)
     assert settings["zooms"][0] < 0.7  # and not where they were made for
 

@@ -12,13 +12,13 @@ from triton_drawing import MARKS, WIDE, assert_equal, deterministic, draw, refer
 
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.conformance import CASES, check_case
-from mipmap_plugin.backends.conformance.cases import covariances
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.backends.triton import TritonBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import USUAL, RenderSettings
 from mipmap_plugin.splatting.harmonics import C0
+from mipmap_plugin.splatting.projection import covariances_of
 
 pytestmark = MARKS
 
@@ -82,7 +82,7 @@ def test_bands_left_out_have_no_gradient():
 
 def test_covariances_need_not_be_symmetric_to_have_their_gradient():
     g = gaussians(12).to(dtype=torch.float32)
-    tilted = covariances(g) + 1e-4 * torch.randn(12, 3, 3, generator=torch.Generator().manual_seed(3))
+    tilted = covariances_of(g) + 1e-4 * torch.randn(12, 3, 3, generator=torch.Generator().manual_seed(3))
     g = replace(g, covariances=tilted)
     result = triton_result(g, camera(16, 16))
     assert set(result[2]) == {"means", "opacities", "sh", "covariances"}

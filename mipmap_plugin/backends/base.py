@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effect, Effects
+from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import USUAL, RenderSettings
 from mipmap_plugin.screen_filters import INTEGRATED
@@ -258,3 +259,18 @@ class Backend(Protocol):
 
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         """The view of `camera`, [H, W, 3] and [H, W], on the device and in the dtype of `gaussians`."""
+
+
+class CachedCheck:
+    """Checks once per kind of request whether a backend can serve it: finding packages and compilers takes longer than a small image."""
+
+    def __init__(self, backend: Backend) -> None:
+        self._backend, self._served = backend, set[Needs]()
+
+    def require(self, gaussians: Gaussians, effects: Effects) -> None:
+        """Raise BackendUnavailable, an ImportError, with every reason why the backend cannot draw and differentiate `gaussians`."""
+        needs = Needs.of(gaussians, effects, gradients=True)
+        if needs not in self._served:
+            if reasons := self._backend.lacking(needs):
+                raise BackendUnavailable(f"backend {self._backend.name!r} cannot do this: {'; '.join(reasons)}")
+            self._served.add(needs)

@@ -13,21 +13,23 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Calls, Capabilities, Needs, Rendered, Stepper
+from mipmap_plugin.backends.base import API_VERSION, SETTINGS, CachedCheck, Calls, Capabilities, Needs, Rendered, Stepper
 from mipmap_plugin.backends.linear_light import in_linear_light
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable, brief, install
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.process.torch_modes import opaque
-from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.screen_filters import INTEGRATED
-from mipmap_plugin.splatting.buckets import ranks_for
+from mipmap_plugin.splatting.buckets import ranks_of_views
 from mipmap_plugin.splatting.packing import packed
 
 NO_NUMBA = f"it needs numba, which some Pythons and processors have no wheels of; where there are, {install('cpu')}"
 NO_FOLDER = "numba has no writable folder for compiled code; set the environment variable NUMBA_CACHE_DIR to one"
 REINSTALL = "install it anew, where there are wheels by pip install --force-reinstall numba, which brings all that it needs"
+
+# Settings that kernels of screen filters that integrate do not read.
+CUT_OFFS = {"min_alpha", "min_transmittance", "radius", "frame"}
 
 # The position of the coefficients among the arguments of `_Draw.forward`.
 SH = 5
@@ -47,12 +49,14 @@ class CpuBackend:
         settings=frozenset(SETTINGS) - {"tile"},
     )
 
+    def __init__(self) -> None:
+        self._check = CachedCheck(self)
+
     def lacking(self, needs: Needs) -> list[str]:
         """The reasons why this backend cannot serve `needs`; empty if it can."""
-        supported = {"max_color", "color_steps", "radial", "bucketed", "even_buckets", "frozen_beyond", "frozen_by_width", "packing"}
-        changed = needs.screen_filter in INTEGRATED and set(needs.settings.changed()) - supported
-        unsupported = [f"it draws the screen filter {needs.screen_filter} with the usual cut-offs only"] if changed else []
-        return self.capabilities.lacking(needs) + unsupported or missing()
+        cut_off = needs.screen_filter in INTEGRATED and CUT_OFFS & set(needs.settings.changed())
+        unsupported = [f"it draws the screen filter {needs.screen_filter} with the usual cut-offs only"] if cut_off else []
+        return self.capabilities.lacking(needs) + unsupported or list(missing())
 
     @opaque
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
@@ -70,16 +74,14 @@ class CpuBackend:
 
     def stepper(self, raw: Mapping[str, Tensor]) -> Stepper:
         """What draws and moves splats of 3DGS by their contiguous raw parameters, as `AdamStep.raw`; without packing and linear light."""
-        _drawing()  # reports what numba lacks
-        from mipmap_plugin.backends.cpu_kernels.stepping import CpuStepper
-
-        return CpuStepper(raw, self._refuse, _ranks)
+        stepper: Stepper = _kernels("stepping").CpuStepper(raw, self._check.require, _ranks)
+        return stepper
 
     def compile_ahead(self, gaussians: Gaussians, effects: Sequence[Effects], calls: Calls) -> None:
         """Start to compile the backward pass in another process, where that pays; the rest is compiled at its first call."""
         if calls.gradients and not missing():
             for each in effects:
-                _ahead().start(gaussians.covariances is not None, each, merging=calls.merging)
+                _kernels("ahead").start(gaussians.covariances is not None, each, merging=calls.merging)
 
     def _drawn(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
         prepared = [self._prepared(gaussians, camera, effects) for camera, effects in shots]
@@ -93,32 +95,20 @@ class CpuBackend:
         if effects.screen_filter == "window":
             return None
         tensors, ranks = self._prepared(gaussians, camera, effects)
-        _drawing()  # reports what numba lacks
-        from mipmap_plugin.backends.cpu_kernels import drawing, weighing
-
-        return torch.from_numpy(weighing.weigh(drawing.as_arrays(*tensors), camera, effects, ranks))
+        return torch.from_numpy(_kernels("weighing").weigh(_kernels("drawing").as_arrays(*tensors), camera, effects, ranks))
 
     def _prepared(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[tuple[Any, ...], Any]:
         """The tensors of the splats, packed as a viewer's file does, and their ranks, where they are sorted by buckets. Raises BackendUnavailable."""
-        self._refuse(gaussians, effects)
-        packing = effects.settings.packing
-        g = gaussians if packing is None else packed(gaussians, camera, packing)
-        ranks = _ranks(gaussians, camera, effects.settings)
-        return (g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances), ranks
-
-    def _refuse(self, gaussians: Gaussians, effects: Effects) -> None:
-        """Raise BackendUnavailable for what it cannot draw."""
-        if reasons := self.lacking(Needs.of(gaussians, effects, gradients=True)):
-            raise BackendUnavailable(f"backend 'cpu' cannot do this: {'; '.join(reasons)}")
+        self._check.require(gaussians, effects)
+        g = packed(gaussians, camera, effects.settings.packing)
+        return (g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances), _ranks(gaussians, camera, effects)
 
 
 def nearest_along(means: Tensor, *further: Tensor, reach: int, limits: tuple[float, float]) -> tuple[Tensor, Tensor] | None:
     """What `cpu_kernels.pairing.nearest_along` finds for float32 splats along a curve; None on another device, or without numba."""
     if not _has_kernels_for(means):
         return None
-    from mipmap_plugin.backends.cpu_kernels import pairing
-
-    nearest, least = pairing.nearest_along(tuple(map(_array, (means, *further))), reach, *limits)
+    nearest, least = _kernels("pairing").nearest_along(tuple(map(_array, (means, *further))), reach, *limits)
     return torch.from_numpy(nearest), torch.from_numpy(least)
 
 
@@ -129,18 +119,15 @@ def summed_areas(means: Tensor, shapes: Iterable[tuple[Tensor, float]], views: S
     """
     if not _has_kernels_for(means):
         return None
-    from mipmap_plugin.backends.cpu_kernels import looking
-
-    return torch.from_numpy(np.stack([looking.areas(_array(means), _array(axes), views, near, variance) for axes, variance in shapes]))
+    areas = _kernels("looking").areas
+    return torch.from_numpy(np.stack([areas(_array(means), _array(axes), views, near, variance) for axes, variance in shapes]))
 
 
 def finest_pixels(means: Tensor, views: Sequence[Camera], near: float) -> tuple[Tensor, Tensor] | None:
     """What `cpu_kernels.looking.finest` finds for float32 means; None on another device, or without numba."""
     if not views or not _has_kernels_for(means):
         return None
-    from mipmap_plugin.backends.cpu_kernels import looking
-
-    sizes, seeing = looking.finest(_array(means), views, near)
+    sizes, seeing = _kernels("looking").finest(_array(means), views, near)
     return torch.from_numpy(sizes), torch.from_numpy(seeing)
 
 
@@ -153,44 +140,32 @@ def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().contiguous().numpy()
 
 
-def _ranks(gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> Any:
-    """`splatting.buckets.ranks_for`; compiled for PlayCanvas's, in whose order many steps of a portable file are drawn."""
-    if not settings.bucketed:
-        found = ranks_for(settings, gaussians, camera)
+def _ranks(gaussians: Gaussians, camera: Camera, effects: Effects) -> Any:
+    """`splatting.buckets.ranks_of_views`, of one; compiled for PlayCanvas's, in whose order many steps of a portable file are drawn."""
+    if not effects.settings.bucketed:
+        [found] = ranks_of_views(gaussians, [(camera, effects)])
         return None if found is None else found.numpy()
-    _drawing()  # reports what numba lacks
-    from mipmap_plugin.backends.cpu_kernels import bucketing
-
-    return bucketing.ranks(_array(gaussians.means), _array(gaussians.scales), camera)
-
-
-def missing() -> list[str]:
-    """What this machine lacks to run the backend, and what to do; empty if nothing. It imports numba."""
-    return [reason] if (reason := _why_no_kernels()) else []
+    return _kernels("bucketing").ranks(_array(gaussians.means), _array(gaussians.scales), camera)
 
 
 @cache  # numba that failed to load is half loaded, and would fail in another way when tried again
-def _why_no_kernels() -> str:
+def missing() -> list[str]:
+    """What this machine lacks to run the backend, and what to do; empty if nothing. It imports numba."""
     if importlib.util.find_spec("numba") is None:
-        return NO_NUMBA
+        return [NO_NUMBA]
     try:
         importlib.import_module("mipmap_plugin.backends.cpu_kernels.drawing")
     except Exception as error:  # numba built for another numpy, or without its compiler, may fail in any way
-        return NO_FOLDER if "cannot cache" in str(error) else f"numba does not load: {type(error).__name__}: {brief(error).rstrip('.')}; {REINSTALL}"
-    return ""
+        failed = f"numba does not load: {type(error).__name__}: {brief(error).rstrip('.')}; {REINSTALL}"
+        return [NO_FOLDER if "cannot cache" in str(error) else failed]
+    return []
 
 
-def _drawing() -> ModuleType:
-    """The kernels. Imported at use. Raises BackendUnavailable if they do not load."""
+def _kernels(module: str) -> ModuleType:
+    """A module of `cpu_kernels`, imported at use. Raises BackendUnavailable if the kernels do not load."""
     if reasons := missing():
         raise BackendUnavailable(f"backend 'cpu' cannot do this: {'; '.join(reasons)}")
-    return importlib.import_module("mipmap_plugin.backends.cpu_kernels.drawing")
-
-
-def _ahead() -> ModuleType:
-    from mipmap_plugin.backends.cpu_kernels import ahead
-
-    return ahead
+    return importlib.import_module(f"mipmap_plugin.backends.cpu_kernels.{module}")
 
 
 class _Draw(torch.autograd.Function):
@@ -198,11 +173,11 @@ class _Draw(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, shots: Sequence[tuple[Camera, Effects, Any]], *tensors: Any) -> tuple[Tensor, ...]:
-        drawing, gradients = _drawing(), any(ctx.needs_input_grad)
+        drawing, gradients = _kernels("drawing"), any(ctx.needs_input_grad)
         ctx.kinds = {(tensors[-1] is not None, effects) for _, effects, _ in shots}
         if gradients:
             for kind in ctx.kinds:
-                _ahead().start(*kind)
+                _kernels("ahead").start(*kind)
         ctx.splats = drawing.as_arrays(*tensors)
         ctx.drawings = drawing.draw(ctx.splats, [drawing.Shot(*shot) for shot in shots], gradients=gradients)
         ctx.save_for_backward(*tensors)
@@ -214,8 +189,8 @@ class _Draw(torch.autograd.Function):
         tensors = ctx.saved_tensors  # read even where unused: torch raises an error here if one was modified in place
         arrays = [gradient.contiguous().numpy() for gradient in d_outputs]
         for kind in ctx.kinds:
-            _ahead().wait(*kind)
+            _kernels("ahead").wait(*kind)
         pairs = list(zip(arrays[::2], arrays[1::2], strict=True))
-        grads = _drawing().draw_back(ctx.splats, ctx.drawings, pairs, harmonics=ctx.needs_input_grad[SH])
+        grads = _kernels("drawing").draw_back(ctx.splats, ctx.drawings, pairs, harmonics=ctx.needs_input_grad[SH])
         # Gradients that are not wanted, and those of the shape that is not in use, are empty: None for torch.
         return None, *(torch.from_numpy(g) if t is not None and len(g) == len(t) else None for t, g in zip(tensors, grads, strict=True))

@@ -1,34 +1,16 @@
-"""Shared by the GPU backends: requirement checks, and the preparation of splats for other projects' rasterizers."""
+"""Shared by the GPU backends: the preparation of splats for other projects' rasterizers."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from mipmap_plugin.backends.base import Backend, Needs
 from mipmap_plugin.backends.reference import finite_rows
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.rotations import unit
 
 NO_CUDA = "it needs a CUDA GPU, and torch sees none here"
-
-
-class CachedCheck:
-    """Checks once per kind of request whether a backend can serve it: finding packages and compilers takes longer than a small image."""
-
-    def __init__(self, backend: Backend) -> None:
-        self._backend, self._served = backend, set[Needs]()
-
-    def require(self, needs: Needs) -> None:
-        """Raise BackendUnavailable, an ImportError, with every reason why the backend cannot serve `needs`."""
-        if needs in self._served:
-            return
-        reasons = self._backend.lacking(needs)
-        if reasons:
-            raise BackendUnavailable(f"backend {self._backend.name!r} cannot do this: {'; '.join(reasons)}")
-        self._served.add(needs)
 
 
 def at_the_origin(camera: Camera) -> Camera:

@@ -26,8 +26,8 @@ from typing import Any
 
 import torch
 
-from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.external import NO_CUDA, CachedCheck, at_the_origin, finite_splats, normalized
+from mipmap_plugin.backends.base import API_VERSION, CachedCheck, Capabilities, Needs, Rendered
+from mipmap_plugin.backends.external import NO_CUDA, at_the_origin, finite_splats, normalized
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -61,7 +61,7 @@ class GsplatBackend:
 
         The host synchronizes with the GPU twice: here for whether all splats are finite, in gsplat for the number of (splat, tile) pairs.
         """
-        self._check.require(Needs.of(gaussians, effects, gradients=True))
+        self._check.require(gaussians, effects)
         if reason := unloadable():
             raise BackendUnavailable(f"backend 'gsplat' cannot do this: {reason}")
         gaussians = finite_splats(gaussians)

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mipmap_plugin.backends.base import AdamStep, Calls, Needs, Rendered, Stepper
+from mipmap_plugin.backends.base import AdamStep, Needs, Rendered, Stepper
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import PluginError, type_of
@@ -44,10 +44,12 @@ class Guarded:
 
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         """See `base.Backend`."""
-        watched = _watched(self._title, gaussians)
-        with naming(self._title), unchanged(self._title, _tensors(gaussians)):
-            rendered = self.theirs.render(watched, camera, effects)
-        return self._checked(rendered, gaussians, camera, effects)
+        return self._checked(self._call(self.theirs.render, _watched(self._title, gaussians), camera, effects), gaussians, camera, effects)
+
+    def _call(self, theirs: Callable[..., Any], gaussians: Gaussians, *arguments: Any) -> Any:
+        """What a method of the backend returns. Raises PluginError if it fails, or changes the splats."""
+        with naming(self._title), unchanged(self._title, gaussians.tensors()):
+            return theirs(gaussians, *arguments)
 
     def _checked(self, rendered: Any, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         image, wanted = getattr(rendered, "image", None), (*camera.size, 3)
@@ -77,7 +79,7 @@ class Guarded:
 
     def _joined(self, image: Tensor, gaussians: Gaussians, effects: Effects) -> Tensor:
         """The image as a part of the gradient graph: one of nothing may come without gradients, which are 0. Raises PluginError for any other."""
-        differentiable = [tensor for tensor in _tensors(gaussians).values() if tensor.requires_grad] if torch.is_grad_enabled() else []
+        differentiable = [tensor for tensor in gaussians.tensors().values() if tensor.requires_grad] if torch.is_grad_enabled() else []
         if image.requires_grad or not differentiable or self.theirs.lacking(Needs.of(gaussians, effects, gradients=True)):
             return image
         if (image != image[:1, :1]).any():
@@ -97,36 +99,30 @@ class Guarded:
         return alpha
 
     def _render_views(self, theirs: Any, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
-        watched = _watched(self._title, gaussians)
-        with naming(self._title), unchanged(self._title, _tensors(gaussians)):
-            views = theirs(watched, shots)
+        views = self._call(theirs, _watched(self._title, gaussians), shots)
         if not isinstance(views, (list, tuple)) or len(views) != len(shots):
             got = f"{len(views)}" if isinstance(views, (list, tuple)) else type_of(views)
             raise PluginError(f"{self._title}: render_views has to return a list of {len(shots)} Rendered, one for each view; it returned {got}")
         return [self._checked(view, gaussians, *shot) for view, shot in zip(views, shots, strict=True)]
 
     def _blend_weights(self, theirs: Any, gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor | None:
-        with naming(self._title), unchanged(self._title, _tensors(gaussians)):
-            weights: Tensor | None = theirs(gaussians, camera, effects)
-        if weights is not None and (not isinstance(weights, Tensor) or tuple(weights.shape) != (len(gaussians),) or not weights.isfinite().all()):
+        weights: Tensor | None = self._call(theirs, gaussians, camera, effects)
+        if weights is not None and not _are_numbers(weights, len(gaussians)):
             raise PluginError(f"{self._title}: blend_weights has to return {len(gaussians)} finite numbers, one for each splat, or None")
         return weights
 
     def _weigh_views(self, theirs: Any, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> Tensor:
-        with naming(self._title), unchanged(self._title, _tensors(gaussians)):
-            weights: Tensor = theirs(gaussians, shots)
+        weights: Tensor = self._call(theirs, gaussians, shots)
         wanted = len(shots), len(gaussians)
-        if not isinstance(weights, Tensor) or tuple(weights.shape) != wanted or not weights.isfinite().all():
+        if not _are_numbers(weights, *wanted):
             raise PluginError(f"{self._title}: weigh_views has to return finite numbers {list(wanted)}, one for each view and splat")
         return weights
 
-    def _stepper(self, theirs: Any, raw: Mapping[str, Tensor]) -> Stepper:
+    def _stepper(self, theirs: Any, raw: Mapping[str, Tensor]) -> _GuardedStepper:
         with naming(self._title):
             return _GuardedStepper(self._title, theirs(raw))
 
-    def _compile_ahead(self, theirs: Any, gaussians: Gaussians, effects: Sequence[Effects], calls: Calls) -> None:
-        with naming(self._title), unchanged(self._title, _tensors(gaussians)):
-            theirs(gaussians, effects, calls)
+    _compile_ahead = _call
 
 
 class _GuardedStepper:
@@ -136,33 +132,25 @@ class _GuardedStepper:
         self._title, self._theirs = title, theirs
 
     def __getattr__(self, name: str) -> Any:
-        """What it may have beside: `prepare`, or `render_all` and `differentiate_all`."""
-        if name not in ("prepare", "render_all", "differentiate_all"):
+        """A method of the stepper itself, some of which it may lack."""
+        if name.startswith("_"):  # which copying asks an empty object for
             raise AttributeError(name)
         return partial(self._named, getattr(self._theirs, name))
 
-    def _named(self, theirs: Callable[..., Any], *args: Any) -> Any:
+    def _named(self, theirs: Callable[..., Any], *arguments: Any) -> Any:
         with naming(self._title):
-            return theirs(*args)
-
-    def render(self, number: int, camera: Camera, effects: Effects) -> Rendered:
-        with naming(self._title):
-            return self._theirs.render(number, camera, effects)
-
-    def differentiate(self, number: int, d_image: Tensor, d_alpha: Tensor | None = None) -> None:
-        with naming(self._title):
-            self._theirs.differentiate(number, d_image, d_alpha)
+            return theirs(*arguments)
 
     def step(self, step: AdamStep) -> None:
-        with naming(self._title):
-            self._theirs.step(step)
+        self._named(self._theirs.step, step)
         finite = torch.stack([tensor.isfinite().all() for tensor in step.raw.values()]).tolist()  # a GPU is waited for once
         if wrong := [name for name, whole in zip(step.raw, finite, strict=True) if not whole]:
             raise PluginError(f"{self._title}: a step left NaN or infinity in {', '.join(wrong)}")
 
 
-def _tensors(gaussians: Gaussians) -> dict[str, Tensor]:
-    return {name: tensor for name, tensor in vars(gaussians).items() if isinstance(tensor, Tensor)}
+def _are_numbers(thing: Any, *shape: int) -> bool:
+    """Whether a thing is a tensor of this shape, of finite numbers."""
+    return isinstance(thing, Tensor) and thing.shape == shape and bool(thing.isfinite().all())
 
 
 def _watched(title: str, gaussians: Gaussians) -> Gaussians:
@@ -175,7 +163,7 @@ def _watched(title: str, gaussians: Gaussians) -> Gaussians:
 
     if not torch.is_grad_enabled():
         return gaussians
-    return replace(gaussians, **{name: watched(name, tensor) for name, tensor in _tensors(gaussians).items() if tensor.requires_grad})
+    return replace(gaussians, **{name: watched(name, tensor) for name, tensor in gaussians.tensors().items() if tensor.requires_grad})
 
 
 def _refuse_gradient(title: str, name: str, gradient: Tensor) -> None:

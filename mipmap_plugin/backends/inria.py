@@ -26,16 +26,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.external import NO_CUDA, CachedCheck, at_the_origin, finite_splats, normalized
+from mipmap_plugin.backends.base import API_VERSION, CachedCheck, Capabilities, Needs, Rendered
+from mipmap_plugin.backends.external import NO_CUDA, at_the_origin, finite_splats, normalized
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.screen_filters import DILATION
 from mipmap_plugin.splatting.filters import footprint
-from mipmap_plugin.splatting.projection import project
-from mipmap_plugin.splatting.rotations import rotations
+from mipmap_plugin.splatting.projection import covariances_of, project
 
 PACKAGE = "diff_gaussian_rasterization"
 NO_PACKAGE = f"it needs {PACKAGE}, which is built from INRIA's sources (for non-commercial use)"
@@ -72,7 +71,7 @@ class InriaBackend:
 
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         """The view of `camera`. Raises BackendUnavailable, an ImportError, if this backend cannot serve the request."""
-        self._check.require(Needs.of(gaussians, effects, gradients=True))
+        self._check.require(gaussians, effects)
         gaussians = finite_splats(gaussians)
         if len(gaussians) == 0:
             return ReferenceBackend().render(gaussians, camera, effects)
@@ -167,11 +166,7 @@ def filtered(gaussians: Gaussians, camera: Camera, effects: Effects) -> Gaussian
     # 1 px² along x or y at depth z is a variance of (z/fx)² or (z/fy)² along the camera's axes, wherever on the image the splat lies.
     axes = rotation[:2] / rotation.new_tensor([[camera.fx], [camera.fy]])
     added = (effects.eps2d - DILATION) * depths.square()[:, None, None] * (axes.T @ axes)
-    covariances = gaussians.covariances
-    if covariances is None:
-        factor = rotations(gaussians.quats) * gaussians.scales[:, None, :]
-        covariances = factor @ factor.mT
-    return replace(gaussians, opacities=footprints.opacities, covariances=covariances + added)
+    return replace(gaussians, opacities=footprints.opacities, covariances=covariances_of(gaussians) + added)
 
 
 @dataclass(frozen=True)
@@ -179,10 +174,8 @@ class Frame:
     """The camera that is rendered in place of another, and where the other's image lies in its image."""
 
     camera: Camera
-    left: int  # px
-    top: int  # px
-    width: int  # px
-    height: int  # px
+    rows: slice
+    columns: slice
 
     @classmethod
     def around(cls, camera: Camera) -> Frame:
@@ -190,11 +183,11 @@ class Frame:
         left, width = _centered(camera.width, camera.cx)
         top, height = _centered(camera.height, camera.cy)
         wider = replace(camera, width=width, height=height, cx=camera.cx + left, cy=camera.cy + top)
-        return cls(wider, left, top, camera.width, camera.height)
+        return cls(wider, slice(top, top + camera.height), slice(left, left + camera.width))
 
     def crop(self, image: Tensor) -> Tensor:
         """The camera's own image [height, width, ...], cropped from the rendered one."""
-        return image[self.top : self.top + self.height, self.left : self.left + self.width]
+        return image[self.rows, self.columns]
 
 
 def _centered(size: int, center: float) -> tuple[int, int]:

@@ -20,16 +20,18 @@ from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.screen_filters import SCREEN_FILTERS
-from mipmap_plugin.splatting import buckets
+from mipmap_plugin.splatting.buckets import ranks_of_views
 from mipmap_plugin.splatting.compositing import SortedSplats, composite, independent
 from mipmap_plugin.splatting.filters import Footprint, footprint
 from mipmap_plugin.splatting.harmonics import colors
 from mipmap_plugin.splatting.packing import packed, round_to
 from mipmap_plugin.splatting.pixel_integral import PixelIntegral
 from mipmap_plugin.splatting.precision import exact
-from mipmap_plugin.splatting.projection import Projected, project
+from mipmap_plugin.splatting.projection import project
 from mipmap_plugin.splatting.surfels import Surfels, surfels
 from mipmap_plugin.splatting.window import WindowIntegral
+
+Footprints = Footprint | PixelIntegral | Surfels
 
 
 class ReferenceBackend:
@@ -49,14 +51,13 @@ class ReferenceBackend:
         settings = effects.settings
         if settings.linear_light is not None:
             return in_linear_light(self.render, gaussians, camera, effects)
-        ranks = buckets.ranks_for(settings, gaussians, camera)
-        if settings.packing is not None:
-            gaussians = packed(gaussians, camera, settings.packing)
+        [ranks] = ranks_of_views(gaussians, [(camera, effects)])
+        gaussians = packed(gaussians, camera, settings.packing)
         with torch.no_grad():
             rows = drawn_rows(gaussians, camera, effects, ranks)
         gaussians = gaussians[rows]
         wide = exact(gaussians)
-        projected, footprints = _footprints(wide, camera, effects, gaussians.means.dtype)
+        means2d, _, footprints = _footprints(wide, camera, effects, gaussians.means.dtype)
         degree = min(effects.sh_degree, gaussians.sh_degree)
         rgb = colors(gaussians.sh, wide.means, camera.center.to(wide.means), degree)
         if settings.max_color is not None:
@@ -66,27 +67,28 @@ class ReferenceBackend:
         least = least_alpha(footprints, settings)
         by_splat = independent(footprints.alpha, settings.max_alpha, settings.culls)
         alphas, memory = (footprints.alphas, footprints.MEMORY_FACTOR) if isinstance(footprints, WindowIntegral) else (by_splat, 1)
-        splats = SortedSplats(projected.means2d.to(rgb), footprints.packed(), rgb, least, alphas, memory)
+        splats = SortedSplats(means2d.to(rgb), footprints.packed(), rgb, least, alphas, memory)
         image, transmittance = composite(splats, footprints.extents(least), camera, settings, rgb.new_tensor(effects.background))
         return Rendered(image, 1 - transmittance)
 
 
-def drawn_rows(gaussians: Gaussians, camera: Camera, effects: Effects, ranks: Tensor | None = None) -> Tensor:
-    """Indices of the splats that can touch the image, front to back; in ascending order of `ranks` [N], if given.
+def drawn_rows(gaussians: Gaussians, camera: Camera, effects: Effects, ranks: Tensor | None) -> Tensor:
+    """Indices of the splats that can touch the image, front to back; in ascending order of `ranks` [N], or of their depths.
 
     Computed first and without gradients, so that splats that are not drawn, even NaN, are not part of any gradient.
     """
     wide = exact(gaussians)
-    projected, footprints = _footprints(wide, camera, effects, gaussians.means.dtype)
+    means2d, depths, footprints = _footprints(wide, camera, effects, gaussians.means.dtype)
     least = least_alpha(footprints, effects.settings)
     half = footprints.extents(least)
-    low, high = projected.means2d - half, projected.means2d + half
-    inside = (high > 0).all(1) & (low < low.new_tensor([camera.width, camera.height])).all(1)
+    low, high = means2d - half, means2d + half
+    size = low.new_tensor([camera.width, camera.height])
+    inside = (high > 0).all(1) & (low < size).all(1)
     if effects.settings.frame < math.inf:
-        inside &= (2 * projected.means2d / low.new_tensor([camera.width, camera.height]) - 1).abs().amax(1) <= effects.settings.frame
-    drawn = finite_rows(gaussians) & (projected.depths > effects.near_plane) & footprints.visible(least) & inside
+        inside &= (2 * means2d / size - 1).abs().amax(1) <= effects.settings.frame
+    drawn = finite_rows(gaussians) & (depths > effects.near_plane) & footprints.visible(least) & inside
     rows = drawn.nonzero()[:, 0]
-    keys = (wide.means - camera.center.to(wide.means)).norm(dim=1) if effects.settings.radial else projected.depths
+    keys = (wide.means - camera.center.to(wide.means)).norm(dim=1) if effects.settings.radial else depths
     keys = keys if ranks is None else ranks
     return rows[keys[rows].argsort(stable=True)]
 
@@ -99,7 +101,7 @@ def finite_rows(gaussians: Gaussians) -> Tensor:
 
 
 @torch.no_grad()
-def least_alpha(footprints: Footprint | PixelIntegral | Surfels, settings: RenderSettings) -> Tensor:
+def least_alpha(footprints: Footprints, settings: RenderSettings) -> Tensor:
     """The alpha below which each splat is not drawn, [N]: `min_alpha`, or exp(-r²/2) times its peak if it is cut at a radius of r.
 
     A splat that fades is not cut: its alpha is 0 at that radius.
@@ -111,16 +113,14 @@ def least_alpha(footprints: Footprint | PixelIntegral | Surfels, settings: Rende
     return (footprints.alpha(parameters, zero, zero) * math.exp(-(settings.radius**2) / 2)).clamp_min(settings.min_alpha)
 
 
-def _footprints(
-    gaussians: Gaussians, camera: Camera, effects: Effects, dtype: torch.dtype
-) -> tuple[Projected, Footprint | PixelIntegral | Surfels]:
-    """The projection in the dtype of `gaussians`, and the footprints in `dtype`."""
-    footprints: Footprint | PixelIntegral | Surfels
+def _footprints(gaussians: Gaussians, camera: Camera, effects: Effects, dtype: torch.dtype) -> tuple[Tensor, Tensor, Footprints]:
+    """Means on the image, [N, 2] px, and depths, [N], in the dtype of `gaussians`; and the footprints in `dtype`."""
+    footprints: Footprints
     if effects.screen_filter == SURFEL:
-        projected, footprints = surfels(gaussians, camera, effects)
+        means2d, depths, footprints = surfels(gaussians, camera, effects)
     else:
         projected = project(gaussians, camera, effects.near_plane, effects.settings)
-        most = effects.settings.max_variance(camera.width, camera.height)
+        means2d, depths, most = projected.means2d, projected.depths, effects.settings.max_variance(camera.width, camera.height)
         footprints = footprint(projected, gaussians.opacities, effects.screen_filter, effects.eps2d, effects.settings, most)
     rounded: dict[str, Any] = {name: value.to(dtype) for name, value in vars(footprints).items() if isinstance(value, Tensor)}
-    return projected, replace(footprints, **rounded)
+    return means2d, depths, replace(footprints, **rounded)

@@ -26,8 +26,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Calls, Capabilities, Needs, Rendered, Stepper
-from mipmap_plugin.backends.external import NO_CUDA, CachedCheck
+from mipmap_plugin.backends.base import API_VERSION, SETTINGS, CachedCheck, Calls, Capabilities, Needs, Rendered, Stepper
+from mipmap_plugin.backends.external import NO_CUDA
 from mipmap_plugin.backends.linear_light import in_linear_light
 from mipmap_plugin.camera import ONE_PIXEL, Camera
 from mipmap_plugin.effects import Effects
@@ -108,16 +108,13 @@ class TritonBackend:
     def _prepared(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[tuple[tuple[Tensor | None, ...], list[Shot]]]:
         """The tensors of the splats, packed as a viewer's file does, and the views that are drawn of them at once. Raises BackendUnavailable."""
         for _, effects in shots:
-            self._check.require(Needs.of(gaussians, effects, gradients=True))
+            self._check.require(gaussians, effects)
         from mipmap_plugin.backends.triton_kernels.views import Shot
 
-        ranks = ranks_of_views(gaussians, [(camera, effects.settings) for camera, effects in shots])
-        ranked = [Shot(*shot, own) for shot, own in zip(shots, ranks, strict=True)]
+        ranked = [Shot(*shot, ranks) for shot, ranks in zip(shots, ranks_of_views(gaussians, shots), strict=True)]
         if all(effects.settings.packing is None for _, effects in shots):
             return [(_tensors(gaussians), ranked)]
-        packings = [effects.settings.packing for _, effects in shots]
-        splats = [gaussians if packing is None else packed(gaussians, shot.camera, packing) for shot, packing in zip(ranked, packings, strict=True)]
-        return [(_tensors(own), [shot]) for own, shot in zip(splats, ranked, strict=True)]
+        return [(_tensors(packed(gaussians, shot.camera, shot.effects.settings.packing)), [shot]) for shot in ranked]
 
     def compile_ahead(self, gaussians: Gaussians, effects: Sequence[Effects], calls: Calls) -> None:
         """Compile on all threads what draws such splats with any of the effects."""

@@ -20,21 +20,22 @@ from mipmap_plugin.levels.contents import Contents, CurvePoint, LeftOut, Level, 
 from mipmap_plugin.levels.distance.ladder import by_distance, make_levels_by_distance
 from mipmap_plugin.levels.finished import Ladder
 from mipmap_plugin.levels.manifest import write_ladder
-from mipmap_plugin.levels.request import FINEST_RATIO, SAME, Band, LadderRequest
+from mipmap_plugin.levels.request import FINEST_RATIO, MERGING_COSTS, MOST_LOST, SAME, Band, LadderRequest
 from mipmap_plugin.levels.store import LevelStore
-from mipmap_plugin.levels.switching import switching_zoom, zooms_between
+from mipmap_plugin.levels.switching import EVEN, switching_zoom, zooms_between
 from mipmap_plugin.levels.yardstick import Yardstick
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.base import SplatModel, why_no_viewer
 from mipmap_plugin.process import threads
 from mipmap_plugin.progress import announced
+from mipmap_plugin.recipes import recipe
 
 # Two neighboring zooms of the curve of dB are at most this factor apart.
 CURVE_STEP = 2**0.25
 
-# Why a level is left out. The first may come after levels that are merged, which have fewer splats than the base.
+# Why a level is left out.
 NOT_BETTER = "adapting gave nothing better than the base as it is"
-MORE_SPLATS = "more splats than the finer level has"
+NO_FEWER = "it is no better there than the finer level, and has no fewer splats"
 UNSHOWN = "at every zoom a neighbor is as good"
 
 
@@ -88,7 +89,7 @@ class _Work:
         levels, left_out, ratio = [first], list[LeftOut](), band.ratio
         while not self._ends(levels[-1], band):
             level, ratio = self._next(levels[-1], band, len(levels) + len(left_out), ratio)
-            band, reason = level.band, _no_use(level, levels[-1])
+            band, reason = level.band, _no_use(level, levels[-1], self.yardstick)
             if reason is None:
                 levels.append(level)
             else:
@@ -100,11 +101,19 @@ class _Work:
         start, ratio = FinerLevel(finer.adapted.model, finer.band.scale), self.request.next_ratio(above.low, ratio)
         while True:
             band = above.next(ratio, self.request.coarsest)
-            level = self._made(f"level_{number}_x{band.scale:.6g}", band, self.request.arguments(self.request.below(start, band)))
+            level = self._below(finer, f"level_{number}_x{band.scale:.6g}", band, self.request.arguments(self.request.below(start, band)))
             narrower = ratio**0.5
             if self._suffices(level) or narrower * SAME < FINEST_RATIO:
                 return level, ratio
             ratio = narrower
+
+    def _below(self, finer: Level, name: str, band: Band, arguments: dict[str, Any]) -> Level:
+        """A level below a finer one. Where steps regained too little of what merging cost, it is made again, merged as the recipe allows."""
+        level = self._made(name, band, arguments)
+        lost = _better(self.yardstick, finer, level, band.scale)
+        if arguments.get("merging_costs") != MERGING_COSTS or lost <= MOST_LOST:
+            return level
+        return self._made(f"{name}_merged_less", band, {**arguments, "merging_costs": recipe(self.request.recipe, band.scale).merging_costs})
 
     def _ends(self, coarsest: Level, last: Band) -> bool:
         """Whether the ladder needs no level below its coarsest one, after the band that was the last to be adapted to."""
@@ -120,11 +129,16 @@ class _Work:
         return least is None or min(self.yardstick.psnr(level.adapted, zoom) for zoom in (level.band.low, level.band.high)) >= least
 
 
-def _no_use(level: Level, finer: Level) -> str | None:
-    """Why a level is no use below a finer one, whose splats cost a viewer no more; None if it is."""
-    if level.adapted.report.holds_base():
-        return NOT_BETTER
-    return MORE_SPLATS if level.splats > finer.splats else None
+def _better(yardstick: Yardstick, level: Level, other: Level, zoom: float) -> float:
+    """By how many dB a level is better than another one at a zoom."""
+    return yardstick.psnr(level.adapted, zoom) - yardstick.psnr(other.adapted, zoom)
+
+
+def _no_use(level: Level, finer: Level, yardstick: Yardstick) -> str | None:
+    """Why a level is no use below a finer one: it costs a viewer as much, and is no better at its own scale; None if it is."""
+    if level.splats < finer.splats or _better(yardstick, level, finer, level.band.scale) > EVEN:
+        return None
+    return NOT_BETTER if level.adapted.report.holds_base() else NO_FEWER
 
 
 def _shown(levels: list[Level], yardstick: Yardstick) -> tuple[list[Level], list[Switch], list[LeftOut]]:
@@ -141,14 +155,17 @@ def _shown(levels: list[Level], yardstick: Yardstick) -> tuple[list[Level], list
 
 
 def _switches(levels: Sequence[Level], yardstick: Yardstick) -> list[Switch]:
-    """The best zooms to change between neighboring levels."""
+    """The best zooms to change between neighboring levels: between their scales, or above both where the coarser is better at the finer's own scale,
+    as merged splats may be where a viewer draws no small ones."""
     switches = []
-    for finer, coarser in pairwise(levels):
+    for above, (finer, coarser) in zip([levels[0], *levels], pairwise(levels), strict=False):
 
         def measure(zoom: float, pair: tuple[Level, Level] = (finer, coarser)) -> tuple[float, float]:
             return yardstick.psnr(pair[0].adapted, zoom), yardstick.psnr(pair[1].adapted, zoom)
 
-        zoom = switching_zoom(coarser.band.scale, finer.band.scale, measure)
+        beaten = _better(yardstick, coarser, finer, finer.band.scale) > EVEN
+        low, high = (finer, above) if beaten else (coarser, finer)
+        zoom = switching_zoom(low.band.scale, high.band.scale, measure)
         switches.append(Switch(zoom, yardstick.psnr(finer.adapted, zoom), yardstick.likeness(finer.adapted, coarser.adapted, zoom)))
     return switches
 

@@ -111,10 +111,13 @@ def progression(rising: Sequence[float], ratio: float) -> tuple[float, float]:
     return max(math.exp(fmean(logs) - slope * middle), NEAREST), math.exp(slope)
 
 
-def viewer_settings(manifest: dict[str, Any], approach: Approach, canvas: int) -> dict[str, Any]:
-    """What a page has to set on its PlayCanvas splat component (the first two) and on `scene.gsplat`, and the zooms at which levels then change."""
+def viewer_settings(manifest: dict[str, Any], approach: Approach | None, canvas: int) -> dict[str, Any]:
+    """What a page has to set on its PlayCanvas splat component (the first two) and on `scene.gsplat`, and the zooms at which levels then change.
+
+    `approach`: None for a ladder by distance, whose levels are made for distances from chunks, not from splats.
+    """
     rising, scales = distances(manifest, canvas), [level["scale"] for level in manifest["levels"]]
-    if manifest.get("by") == "distance":  # such levels are made for distances from chunks, not from splats
+    if approach is None:
         base = max(manifest["lodBaseDistance"] * canvas / manifest["canvas"], NEAREST)
         multiplier = max(manifest["lodMultiplier"], LEAST_MULTIPLIER)
         shown = [base * multiplier**number for number in range(len(rising))]
@@ -149,6 +152,11 @@ def write_streamed(folder: Path, canvas: int = CANVAS) -> Path:
         extent = manifest.get("chunk_extent", max(1, round(EXTENT * rising[0])))
         files = [level["file"] for level in manifest["levels"]]
         write_streamed_sog([readable(folder / file, Path(copies, file)) for file in files], made, extent)
-        middle = load_model(folder / files[0]).parameters()["means"].detach().median(dim=0).values
-        write_json(temporary / SETTINGS, viewer_settings(manifest, Approach.to(middle, read_chunks(made)), canvas), overwrite=False)
+        approach = None if manifest.get("by") == "distance" else _approach(folder / files[0], made)
+        write_json(temporary / SETTINGS, viewer_settings(manifest, approach, canvas), overwrite=False)
     return folder / STREAMED / LOD_META
+
+
+def _approach(finest: Path, made: Path) -> Approach:
+    """To the middle of the finest level's splats."""
+    return Approach.to(load_model(finest).parameters()["means"].detach().median(dim=0).values, read_chunks(made))

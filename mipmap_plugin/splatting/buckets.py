@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import EvenBuckets, RenderSettings
 from mipmap_plugin.splatting.rotations import rotations
@@ -37,17 +38,13 @@ MORTON_BITS = 10
 SPREADING = ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249))
 
 
-def ranks(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """Rank of each splat front to back, [N] int32. Within a bucket splats are in Morton order, whatever their depth.
-
-    Computed in float64, so that every backend gets the same order. The rank of a splat that is not finite is arbitrary.
-    """
-    return view_ranks(gaussians, [camera])[0]
-
-
 @torch.no_grad()
-def view_ranks(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[Tensor]:
-    """As `ranks`, for several cameras: what does not depend on them is found once, and a GPU is waited for once."""
+def ranks(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[Tensor]:
+    """For each camera, the rank of each splat front to back, [N] int32. Within a bucket splats are in Morton order, whatever their depth.
+
+    Computed in float64, so that every backend gets the same order. The rank of a splat that is not finite is arbitrary. What does not depend on
+    the cameras is found once, and a GPU is waited for once.
+    """
     means = gaussians.means.double().nan_to_num(0.0, 0.0, 0.0)
     sizes = gaussians.scales.double().nan_to_num(0.0, 0.0, 0.0).abs().amax(1, keepdim=True)
     if not len(means):
@@ -70,7 +67,7 @@ def _buckets(means: Tensor, scale: DepthScale, camera: Camera) -> Tensor:
 
 @torch.no_grad()
 def even_ranks(gaussians: Gaussians, camera: Camera, even: EvenBuckets) -> Tensor:
-    """As `ranks`, by buckets that divide a range of depths evenly."""
+    """As `ranks`, for one camera, by buckets that divide a range of depths evenly."""
     means = gaussians.means.double().nan_to_num(0.0, 0.0, 0.0)
     if not len(means):
         return torch.zeros(0, dtype=torch.int32, device=means.device)
@@ -102,18 +99,17 @@ def _sphere(gaussians: Gaussians, camera: Camera, least: float) -> tuple[Tensor,
     return (depth - radius).clamp_min(least), depth + radius
 
 
-def ranks_for(settings: RenderSettings, gaussians: Gaussians, camera: Camera) -> Tensor | None:
-    """The ranks by the buckets of these settings; None if splats are sorted exactly."""
-    if settings.bucketed:
-        return ranks(gaussians, camera)
-    return even_ranks(gaussians, camera, settings.even_buckets) if settings.even_buckets else None
+def ranks_of_views(gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[Tensor | None]:
+    """For each view, the ranks by the buckets of its settings; None if its splats are sorted exactly."""
+    bucketed = [camera for camera, effects in shots if effects.settings.bucketed]
+    found = iter(ranks(gaussians, bucketed) if bucketed else [])
 
+    def of(camera: Camera, settings: RenderSettings) -> Tensor | None:
+        if settings.bucketed:
+            return next(found)
+        return even_ranks(gaussians, camera, settings.even_buckets) if settings.even_buckets else None
 
-def ranks_of_views(gaussians: Gaussians, views: Sequence[tuple[Camera, RenderSettings]]) -> list[Tensor | None]:
-    """The same for several views."""
-    bucketed = [camera for camera, settings in views if settings.bucketed]
-    found = iter(view_ranks(gaussians, bucketed) if bucketed else [])
-    return [next(found) if settings.bucketed else ranks_for(settings, gaussians, camera) for camera, settings in views]
+    return [of(camera, effects.settings) for camera, effects in shots]
 
 
 def bucket_bits(count: int) -> int:

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.render_settings import MAX_ALPHA, RenderSettings
+from mipmap_plugin.render_settings import RenderSettings
 
 # (splat, pixel) pairs composited at once. About ten float32 tensors of this size are alive together: 0.3 GiB.
 BATCH_PAIRS = 1 << 23
@@ -34,9 +34,7 @@ class SortedSplats:
     memory_factor: int = 1  # memory that `alphas` takes, relative to a plain Gaussian
 
 
-def independent(
-    alpha: Callable[[Tensor, Tensor, Tensor], Tensor], max_alpha: float = MAX_ALPHA, gated: bool = False
-) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
+def independent(alpha: Callable[[Tensor, Tensor, Tensor], Tensor], max_alpha: float, gated: bool) -> Callable[..., Tensor]:
     """`SortedSplats.alphas` for splats whose alpha does not depend on the splats in front of them. Alpha is clamped to `max_alpha`.
 
     gated: the last footprint parameter is the gate of `culls.gate`, 1 for a splat that is drawn and 0 for one that is culled.
@@ -49,10 +47,8 @@ def independent(
     return alphas
 
 
-def composite(
-    splats: SortedSplats, extents: Tensor, camera: Camera, settings: RenderSettings, background: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """Composite over `background` [3], by default black. Returns the color [H, W, 3] and the transmittance [H, W].
+def composite(splats: SortedSplats, extents: Tensor, camera: Camera, settings: RenderSettings, background: Tensor) -> tuple[Tensor, Tensor]:
+    """Composite over `background` [3]. Returns the color [H, W, 3] and the transmittance [H, W].
 
     `extents` [M, 2]: half-sizes of each splat's bounding box, px.
     """
@@ -63,7 +59,6 @@ def composite(
     nothing = splats.colors[:0].sum() + splats.means2d[:0].sum() + splats.footprints[:0].sum()
     color = nothing + splats.colors.new_zeros(tiles_x * tiles_y, tile**2, 3)
     transmittance = splats.colors.new_ones(tiles_x * tiles_y, tile**2)
-    background = splats.colors.new_zeros(3) if background is None else background
     rounded = background.expand(tiles_x * tiles_y, tile**2, 3)
     filled = int((starts.diff() > 0).sum())
     for tiles, ids in _batches(starts, members, splats.memory_factor * tile**2):

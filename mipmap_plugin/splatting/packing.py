@@ -26,11 +26,13 @@ LEAST_TURN = 1e-6
 CHUNK = 1 << 17
 
 
-def packed(gaussians: Gaussians, camera: Camera, packing: Packing) -> Gaussians:
-    """`gaussians` after `packing`; `camera` matters for means that are stored relative to it. Covariances are not packed.
+def packed(gaussians: Gaussians, camera: Camera, packing: Packing | None) -> Gaussians:
+    """`gaussians` after `packing`, if there is any; `camera` matters for means that are stored relative to it. Covariances are not packed.
 
     Computed in float64, so that every backend rounds the same way.
     """
+    if packing is None:
+        return gaussians
     with torch.no_grad():
         parts = [_rounded(gaussians[start : start + CHUNK], camera, packing) for start in range(0, max(1, len(gaussians)), CHUNK)]
         rounded = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}

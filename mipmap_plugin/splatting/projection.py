@@ -40,6 +40,14 @@ def axes_of(quats: Tensor, scales: Tensor) -> Tensor:
     return rotations(quats) * scales[:, None, :]
 
 
+def covariances_of(gaussians: Gaussians) -> Tensor:
+    """The covariances of splats, [N, 3, 3] world units²: their own, or those of their quaternions and scales."""
+    if gaussians.covariances is not None:
+        return gaussians.covariances
+    axes = axes_of(gaussians.quats, gaussians.scales)
+    return axes @ axes.mT
+
+
 def project(
     gaussians: Gaussians, camera: Camera | CameraTensors, near: float, settings: RenderSettings = USUAL, axes: Tensor | None = None
 ) -> Projected:

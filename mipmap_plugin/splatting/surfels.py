@@ -27,7 +27,6 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.splatting.projection import Projected
 from mipmap_plugin.splatting.rotations import rotations
 
 # Standard deviations: size of the ellipse whose bounding box gives the center of the low-pass filter.
@@ -83,8 +82,8 @@ class Surfels:
         return torch.maximum(own, (reach * self.width.sqrt())[:, None]).detach()
 
 
-def surfels(gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[Projected, Surfels]:
-    """Surfels of splats, and the projection of their low-pass filters' centers. The third scales are ignored.
+def surfels(gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[Tensor, Tensor, Surfels]:
+    """The centers of the low-pass filters, [N, 2] px; the depths, [N]; and the surfels of splats, whose third scales are ignored.
 
     Surfels that are seen edge-on, or contain the eye, get values that are not `visible`.
     """
@@ -103,9 +102,7 @@ def surfels(gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[Pro
     inverse = _inverse(across) / scales.mT  # inverted before the scales, whose product could overflow or vanish
     width = torch.full_like(depths, effects.eps2d)
     footprints = Surfels(axes, inverse, slopes, shift, effects.near_plane / safe, gaussians.opacities, width)
-    spread = axes @ axes.mT
-    det = torch.linalg.det(axes).square()
-    return Projected(directions * focal + middle + shift, depths, spread[:, 0, 0], spread[:, 0, 1], spread[:, 1, 1], det), footprints
+    return directions * focal + middle + shift, depths, footprints
 
 
 def ellipse_box(axes: Tensor, slopes: Tensor, reach: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:

@@ -10,6 +10,9 @@ from mipmap_plugin.models.places import TILES
 # What all jobs need of the scene; the base's splats; what the start is called, and its PSNR.
 CUT, BASE, START = "cut.pt", "base.splats", "start.pt"
 
+# A scene that is not cut needs no tiles.
+FEWEST = 2
+
 
 def work_folder(target: Path) -> Path:
     """Where the parts of a scene lie until it is whole, beside its file."""

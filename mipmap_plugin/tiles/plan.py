@@ -21,7 +21,7 @@ from mipmap_plugin.models.adapted_scale import refuse_adapted
 from mipmap_plugin.models.outputs import parts_of
 from mipmap_plugin.models.places import PLAN
 from mipmap_plugin.splatting.viewers import viewers_for
-from mipmap_plugin.tiles.folder import BASE, CUT, work_folder
+from mipmap_plugin.tiles.folder import BASE, CUT, FEWEST, work_folder
 from mipmap_plugin.tiles.reading import find_splats, make_cut
 
 # Of the folder's files: those of another format are not gone on with.
@@ -33,8 +33,8 @@ def refuse(job: Job, tiles: int) -> None:
     base = find_splats(job.base.checkpoint)[0].path
     config = job.config()
     refuse_adapted(base)
-    if tiles < 2:
-        raise SettingsError(f"tiles: give at least 2, got {tiles}; a scene that is not cut needs no tiles")
+    if tiles < FEWEST:
+        raise SettingsError(f"tiles: give at least {FEWEST}, got {tiles}; a scene that is not cut needs no tiles")
     if job.images is not None or job.scale > 1:
         raise SettingsError(f"x{job.scale:g}: a scene is cut into tiles for a zoom-out, without photographs; adapt it without tiles")
     if job.scale == 1 and job.viewer is None:

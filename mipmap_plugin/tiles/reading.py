@@ -20,7 +20,7 @@ from mipmap_plugin.models.health import MIN_DISTRIBUTION, doubts, dropped, exami
 from mipmap_plugin.models.surfels import SurfelModel
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.tiles.cut import cut
-from mipmap_plugin.tiles.folder import BASE, CUT
+from mipmap_plugin.tiles.folder import BASE, CUT, FEWEST
 from mipmap_plugin.tiles.splats import CHUNK, Splats
 from mipmap_plugin.tiles.store import Store, write_pieces
 
@@ -59,7 +59,8 @@ def make_cut(path: Path, tiles: int, folder: Path) -> None:
     refuse_few(~valid, checkpoint.path)
     kept = valid.nonzero()[:, 0]
     if len(kept) < tiles:
-        raise CheckpointError(f"{checkpoint.path} has {plural(len(kept), 'splat')}, which cannot be cut into {tiles} tiles; give fewer")
+        advice = "leave --tiles out" if len(kept) < FEWEST else "give fewer"
+        raise CheckpointError(f"{checkpoint.path} has {plural(len(kept), 'splat')}, which cannot be cut into {tiles} tiles; {advice}")
     cores, tree = cut(splats.places[:, :3], kept, tiles)  # without sizes, which are no places
     if not found.drawn:
         raise CheckpointError(f"{checkpoint.path}: every splat has an opacity below 1/255, so none is drawn; the training or the export failed")

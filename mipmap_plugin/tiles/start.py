@@ -13,7 +13,7 @@ from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS, pixel_size, views_f
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.blend_weights import may_show, whole_weights
 from mipmap_plugin.adaptation.start.candidates import mildest_costs, start_name
-from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices
+from mipmap_plugin.adaptation.start.closed_form import FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import matched_opacities
 from mipmap_plugin.adaptation.start.merging import merge_seen
 from mipmap_plugin.camera import Camera, evenly
@@ -38,8 +38,8 @@ class StartSearch:
     def __init__(self, scene: TiledScene) -> None:
         self.scene, self.truths = scene, Truths(scene)
         effects = scene.base_effects, scene.target
-        self.forms = scene.config.closed_form and not (filter_suffices(*effects) or draws_alike(*effects))
-        self.matches = scene.scale <= 1 and self.forms
+        keeps = draws_alike(*effects) and scene.config.steps > 0  # as without tiles
+        self.forms = scene.config.closed_form and not (keeps or filter_suffices(*effects))
         self.views: list[Camera] = []  # those in which blend weights are measured, which `_measured` finds
 
     @torch.no_grad()
@@ -103,7 +103,7 @@ class StartSearch:
         cores = range(len(self.scene.cores))
         merged = [self._merged(self._file(name, number), self.scene.cores[number], weights, fraction) for number in cores]
         pool.release_to_system()
-        if self.matches:
+        if self.forms:
             self._match(name, *map(torch.cat, zip(*merged, strict=True)))
             pool.release_to_system()
 
@@ -128,8 +128,7 @@ class StartSearch:
         def formed(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
             nonlocal whole
             pixel, whole = sizes(gaussians)
-            known = pixel if scene.scale <= 1 else None
-            form = FormSettings(1.0 if self.matches else AREA_POWER, scene.config.crispness, len(self.views), known)
+            form = FormSettings(area_power=1.0, views=len(self.views), pixel=pixel, matched=True)
             return closed_form(gaussians, scene.views.adapted, scene.scale, scene.base_effects, scene.target, form)
 
         if fraction < 1:

@@ -9,13 +9,14 @@ import pytest
 import torch
 
 from mipmap_plugin.backends import geometry, get_backend
-from mipmap_plugin.backends.conformance.cases import HardCase, covariances, crowd, view
+from mipmap_plugin.backends.conformance.cases import HardCase, crowd, view
 from mipmap_plugin.backends.conformance.checks import check_case
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.screen_filters import USUAL_EPS2D
 from mipmap_plugin.splatting.precision import finest
+from mipmap_plugin.splatting.projection import covariances_of
 
 BACKENDS = ["reference", "cpu"] if importlib.util.find_spec("numba") else ["reference"]
 
@@ -42,7 +43,7 @@ def of_needles(effects: Effects) -> HardCase:
     """Needles of a thousandth of a pixel by a hundred pictures, whose covariances are handed over."""
     splats = crowd()
     needles = replace(splats, scales=torch.tensor([[100.0, 1e-4, 2e-4]], dtype=torch.float64).expand(len(splats), 3))
-    return HardCase(replace(needles, covariances=covariances(needles)), view(turned=True), effects)
+    return HardCase(replace(needles, covariances=covariances_of(needles)), view(turned=True), effects)
 
 
 def filtered(name: str) -> Effects:

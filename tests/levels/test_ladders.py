@@ -16,13 +16,15 @@ from mipmap_plugin.adaptation.report import AS_IT_IS, Report
 from mipmap_plugin.commands.ladders import print_summary
 from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.levels.contents import Contents, LeftOut, Level
-from mipmap_plugin.levels.ladder import MORE_SPLATS, NOT_BETTER, UNSHOWN, _no_use, _shown, make_levels
+from mipmap_plugin.levels.ladder import NO_FEWER, NOT_BETTER, UNSHOWN, _no_use, _shown, _Work, make_levels
 from mipmap_plugin.levels.manifest import MANIFEST, base_pixel, write_ladder
-from mipmap_plugin.levels.request import Band
+from mipmap_plugin.levels.request import MERGING_COSTS, Band
 from mipmap_plugin.models.places import state_path
 from mipmap_plugin.models.vanilla import VanillaModel
 
 pytestmark = pytest.mark.usefixtures("brief_ladders", "few_views")
+
+BAND = Band(1.0, 0.7, 1.0, 2.0)
 
 
 def test_a_level_that_is_the_base_again_is_left_out(tmp_path, monkeypatch, capsys):
@@ -48,12 +50,28 @@ def test_a_level_that_is_the_base_again_is_left_out(tmp_path, monkeypatch, capsy
 
 
 @pytest.mark.parametrize(
-    ("returned", "splats", "reason"),
-    [("merged splats", 9, None), ("merged splats", 10, None), ("step 3", 11, MORE_SPLATS), (f"{AS_IT_IS}: 30 dB", 9, NOT_BETTER)],
-)
-def test_a_coarser_level_has_no_more_splats_than_a_finer_one(returned, splats, reason):
-    level = SimpleNamespace(adapted=SimpleNamespace(report=Report.model_construct(returned=returned, validation={})), splats=splats)
-    assert _no_use(level, SimpleNamespace(splats=10)) == reason
+    ("returned", "splats", "psnr", "reason"),
+    [
+        ("merged splats", 9, 20, None), ("merged splats", 10, 30.4, NO_FEWER), ("the closed form", 11, 40, None), ("step 3", 11, 30, NO_FEWER),
+        (f"{AS_IT_IS}: 30 dB", 10, 30, NOT_BETTER), (f"{AS_IT_IS}: 30 dB", 10, 31, None),
+    ],
+)  # fmt: skip
+def test_a_coarser_level_has_fewer_splats_than_the_finer_one_or_is_better(returned, splats, psnr, reason):
+    report = Report.model_construct(returned=returned, validation={})
+    level, finer = (Level(SimpleNamespace(psnr=db, report=report, model=tiny.model(n)), BAND) for db, n in ((psnr, splats), (30, 10)))
+    assert _no_use(level, finer, SimpleNamespace(psnr=lambda each, _: each.psnr)) == reason
+
+
+@pytest.mark.parametrize(("psnr", "splats"), [(27.5, 2), (26.5, 8)])
+def test_a_level_whose_steps_regain_too_little_of_what_merging_cost_is_made_again(monkeypatch, psnr, splats):
+    """It may be 3 dB worse than the finer level, whose PSNR is 30 dB."""
+    monkeypatch.setattr("mipmap_plugin.levels.ladder.MOST_LOST", 3.0)
+    few, many = (SimpleNamespace(psnr=db, model=tiny.model(n)) for db, n in ((psnr, 2), (29, 8)))
+    base = SimpleNamespace(adapt=lambda scale, *, merging_costs, **_: few if merging_costs == MERGING_COSTS else many)
+    yardstick = SimpleNamespace(psnr=lambda each, _: each.psnr)
+    work = _Work(base, request(), SimpleNamespace(level=lambda name, make: make(None)), yardstick)
+    made, _ = work._next(Level(SimpleNamespace(psnr=30, model=tiny.model(9)), BAND), BAND, 1, 2.0)
+    assert made.splats == splats
 
 
 def test_a_level_that_is_shown_at_no_zoom_is_left_out():
@@ -64,6 +82,17 @@ def test_a_level_that_is_shown_at_no_zoom_is_left_out():
     shown, switches, left_out = _shown(levels, yardstick)
     assert shown == [levels[0], levels[2]] and len(switches) == 1 and 0.25 < switches[0].zoom < 1
     assert left_out == [LeftOut(0.5, 2, UNSHOWN)]
+
+
+def test_a_level_is_not_shown_where_a_coarser_one_is_better(monkeypatch):
+    """Level 2 is better than level 1 at that one's own scale, x1/2, and up to x0.7."""
+    for step in ("FIRST_STEP", "SECOND_STEP"):
+        monkeypatch.setattr(f"mipmap_plugin.levels.switching.{step}", 1.05)
+    levels = [Level(SimpleNamespace(number=number), Band(0.5**number, 0, 1, 2)) for number in range(3)]
+    dbs = [lambda zoom: 40 + 40 * math.log2(zoom), lambda _: 30, lambda zoom: 30 - 10 * math.log2(zoom / 0.7)]
+    yardstick = SimpleNamespace(psnr=lambda level, zoom: dbs[level.number](zoom), likeness=lambda *_: 30)
+    _, switches, left_out = _shown(levels, yardstick)
+    assert 0.8 < switches[0].zoom < 0.9 and 0.65 < switches[1].zoom < 0.75 and not left_out
 
 
 def test_a_ladder_ends_with_few_enough_splats():

@@ -123,6 +123,13 @@ def test_anchors_cannot_be_cut(tmp_path, job):
         adapt_in_tiles(replace(job, base=replace(job.base, checkpoint=folder)), 2)
 
 
+def test_a_single_splat_is_not_told_to_take_fewer_tiles(job):
+    """There are at least two tiles."""
+    tiny.model(1).save(find_splats(job.base.checkpoint)[0].path, provenance={}, overwrite=True)
+    with pytest.raises(CheckpointError, match="has 1 splat, which cannot be cut into 2 tiles; leave --tiles out"):
+        adapt_in_tiles(job, 2)
+
+
 def test_more_tiles_than_splats(job):
     with pytest.raises(CheckpointError, match="has 80 splats, which cannot be cut into 90 tiles"):
         adapt_in_tiles(job, 90)

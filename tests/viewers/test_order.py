@@ -36,7 +36,7 @@ def test_buckets_are_finer_near_the_camera():
     means[1:, 0] = torch.tensor([4.0, 3.0, 2.0, 1.0, 0.0])  # Morton's order is that of x
     scales = torch.full((6, 3), 1e-3)
     scales[0] = 240.0  # the box ends at two of them
-    places = ranks(Gaussians(means, torch.ones(6, 4), scales, torch.ones(6), torch.zeros(6, 1, 3)), camera())
+    [places] = ranks(Gaussians(means, torch.ones(6, 4), scales, torch.ones(6), torch.zeros(6, 1, 3)), [camera()])
     assert places[1] < places[2] < min(places[3:])  # by depth
     assert places[5] < places[4] < places[3]  # by x
 
@@ -79,8 +79,9 @@ def test_the_order_of_several_views_is_that_of_each():
     splats = Gaussians(means, torch.ones(50, 4), torch.ones(50, 3), torch.ones(50), torch.zeros(50, 1, 3))
     aside = camera().looking_from(torch.tensor([[0.6, 0.0, -0.8, 6.0], [0.0, 1.0, 0.0, 0.0], [0.8, 0.0, 0.6, 4.0], [0.0, 0.0, 0.0, 1.0]]), "")
     bucketed, even = RenderSettings(bucketed=True), EvenBuckets(10)
-    found = ranks_of_views(splats, [(aside, bucketed), (aside, RenderSettings(even_buckets=even)), (camera(), USUAL), (camera(), bucketed)])
-    expected = [ranks(splats, aside), even_ranks(splats, aside, even), None, ranks(splats, camera())]
+    asked = [(aside, bucketed), (aside, RenderSettings(even_buckets=even)), (camera(), USUAL), (camera(), bucketed)]
+    found = ranks_of_views(splats, [(view, Effects(0, settings=settings)) for view, settings in asked])
+    expected = [*ranks(splats, [aside]), even_ranks(splats, aside, even), None, *ranks(splats, [camera()])]
     assert [None if own is None else own.tolist() for own in found] == [None if own is None else own.tolist() for own in expected]
     assert not torch.equal(expected[0], expected[3])
 

@@ -12,9 +12,10 @@ opacity can make up for, so that the blend weight stays the same. For a viewer t
 
 Zoom-in (s > 1) widens the splats, but by less: the images that a base was trained on are averages over pixels, which have a variance of
 p = 1/12 px², and the adapted images should be averages over their own, smaller pixels. Σ + e·ρ² includes this average, so that e and e'
-are both reduced by p, and the opacity is raised by the area that is lost. Images of the base's size do not show how much of e is such an
-average, and how much is a splat's own extent: all values from p = 1/12 to p = e give nearly the same image. A larger p is crisper: with
-p = e splats keep their size, and only opacity makes up for what a zoom takes off them (`FormSettings.crispness`).
+are both reduced by p, and the opacity is raised by the area that is lost. Images of the base's size do not show how thin a splat is whose
+Σ is nearly 0: training would have made it thinner if it could. All values from p = 1/12 to p = e give nearly the same image. A larger p is
+crisper (`FormSettings.crispness`): with p = e splats keep their size, and only opacity makes up for what a zoom takes off them. It cannot
+rise above 1, so that a splat becomes narrower only as far as its opacity allows: what covers its pixels is no thin line.
 
 A file that is rendered with the base's own filter needs no change if that filter integrates over the pixel. One that compensates models the
 pixel in each view too, but with a variance of its own, and overlapping splats whose opacities it lowers let through more than their means
@@ -108,17 +109,18 @@ class _Change:
         base, target, scale = self.base, self.target, self.scale
         if target.screen_filter == SURFEL:
             return self._of_surfels(gaussians, base_pixel)
-        target_pixel = base_pixel / scale
-        averaging = _averaging_variance(base, self.form.crispness) if scale > 1 else 0.0
-        wide = gaussians.scales.square() + ((filter_variance(base) - averaging) * base_pixel**2)[:, None]
-        narrow = (wide - ((filter_variance(target) - averaging) * target_pixel**2)[:, None]).clamp_min(0)
-        if compensates(target.screen_filter):  # the area shrinks only by the factor by which the opacity can rise
-            narrow = narrow.maximum(gaussians.opacities[:, None] * wide)
+        own, base_area, target_area = gaussians.scales.square(), base_pixel.square()[:, None], (base_pixel / scale).square()[:, None]
+        least, most = _averaging_variances(base, self.form.crispness) if scale > 1 else (0.0, 0.0)
+        averaging = least + (most - least) * _unknown(own, base_area, base)
+        wide = own + (filter_variance(base) - averaging) * base_area
+        narrow = (wide - (filter_variance(target) - averaging) * target_area).clamp_min(0)
+        # An area shrinks only by the factor by which the opacity can rise.
+        narrow = narrow.maximum(gaussians.opacities[:, None] * (own + _dilation(base) * base_area) - _dilation(target) * target_area)
         thinnest = torch.full_like(narrow, MIN_AXIS**2).scatter(1, wide.topk(2, dim=1).indices, max(MIN_AXIS**2, min_variance(target)))
-        scales = narrow.maximum(thinnest * target_pixel[:, None].square()).sqrt()
+        scales = narrow.maximum(thinnest * target_area).sqrt()
         new = replace(gaussians, scales=scales)
         opacities = gaussians.opacities * _compensation(gaussians, self.views, base)
-        areas = self._area_ratio(gaussians, new, self._max_area_ratio(averaging))
+        areas = self._area_ratio(gaussians, new, self._max_area_ratio(most))
         opacities = opacities * areas ** (self.form.area_power if scale <= 1 and not compensates(target.screen_filter) else 1.0)
         # The compensation of the target's renderer is divided out beforehand.
         return scales, (opacities / _compensation(new, self.zoomed, target)).clamp_max(1)
@@ -168,8 +170,9 @@ class _Change:
         wide = widened_for_slant(gaussians.scales, wide, 1 / area_ratio(wide))
         if crispness == 0:
             return wide, gaussians.opacities
-        crisp = wide.square().lerp(gaussians.scales.square(), crispness).sqrt()
-        return crisp, (gaussians.opacities * area_ratio(wide) / area_ratio(crisp)).clamp_max(1)
+        shown, crisp = gaussians.opacities * area_ratio(wide), wide.square().lerp(gaussians.scales.square(), crispness).sqrt()
+        crisp = (crisp * (shown / area_ratio(crisp)).clamp_min(1)[:, None]).minimum(wide)  # as far as the opacity can rise
+        return crisp, (shown / area_ratio(crisp)).clamp_max(1)
 
 
 def filter_suffices(base: Effects, target: Effects) -> bool:
@@ -193,10 +196,25 @@ def filter_variance(effects: Effects) -> float:
     return widening(effects.screen_filter, effects.eps2d)
 
 
-def _averaging_variance(base: Effects, crispness: float) -> float:
-    """The variance (px²) over which the base's images are averages: from that of a pixel (crispness 0) to that of the filter (1)."""
+def _dilation(effects: Effects) -> float:
+    """The variance (px²) by which the screen filter makes a splat cover more, without lowering its opacity."""
+    return 0.0 if compensates(effects.screen_filter) else filter_variance(effects)
+
+
+def _averaging_variances(base: Effects, crispness: float) -> tuple[float, float]:
+    """The least and the largest variance (px²) over which the base's images are averages: a pixel's, and up to that of the filter (crispness 1)."""
     pixel = min(SQUARE_VARIANCE, filter_variance(base))
-    return pixel + crispness * (filter_variance(base) - pixel)
+    return pixel, pixel + crispness * (filter_variance(base) - pixel)
+
+
+def _unknown(own: Tensor, base_area: Tensor, base: Effects) -> Tensor:
+    """How little the base tells of the width of splats of these variances [N, 3] along each axis, 0..1; `base_area` [N, 1]: of a base pixel.
+
+    Training made a splat that is wider than a pixel as wide as its images wanted. One that is far thinner would be thinner still if it could, nobody
+    knows by how much. With a filter that compensates, training cannot narrow an opaque splat at all.
+    """
+    pixel = SQUARE_VARIANCE * base_area
+    return torch.ones_like(own) if compensates(base.screen_filter) else pixel / (pixel + own)
 
 
 def _compensation(gaussians: Gaussians, views: Sequence[Camera], effects: Effects) -> Tensor | float:

@@ -17,6 +17,7 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import USUAL, EvenBuckets, RenderSettings
 from mipmap_plugin.screen_filters import DILATION, USUAL_EPS2D
+from mipmap_plugin.splatting.projection import covariances_of
 from mipmap_plugin.splatting.rotations import rotations
 from mipmap_plugin.splatting.viewers import BUILT_IN, Viewer
 
@@ -53,18 +54,10 @@ def crowd(n: int = 12, degree: int = 1, seed: int = 0) -> Gaussians:
     return Gaussians(means, rand(n, 4) - 0.5, scales, 0.05 + 0.9 * rand(n), rand(n, (degree + 1) ** 2, 3) - 0.3)
 
 
-def covariances(gaussians: Gaussians) -> Tensor:
-    """The covariances [N, 3, 3] of the quaternions and scales."""
-    factor = rotations(gaussians.quats) * gaussians.scales[:, None, :]
-    return factor @ factor.mT
-
-
 def odd_row(row: dict[str, Tensor], screen_filter: str = "classic") -> HardCase:
     """A crowd in which the values `row` make one splat hard; the others show whether it harms them."""
-    gaussians = crowd()
-    row = {**_row(means=(0.1, 0.05, 2.5)), **row}
-    tensors = {name: getattr(gaussians, name).index_put((torch.tensor(5),), value) for name, value in row.items()}
-    return HardCase(replace(gaussians, **tensors), view(), Effects(1, screen_filter, USUAL_EPS2D[screen_filter], near_plane=NEAR))
+    gaussians = _with_row(crowd(), 5, {**_row(means=(0.1, 0.05, 2.5)), **row})
+    return HardCase(gaussians, view(), Effects(1, screen_filter, USUAL_EPS2D[screen_filter], near_plane=NEAR))
 
 
 def seen_by(camera: Camera, screen_filter: str = "classic") -> HardCase:
@@ -77,9 +70,9 @@ def of_degree(degree: int, evaluated: int) -> HardCase:
     return HardCase(crowd(degree=degree), view(turned=True), Effects(evaluated), about_degree=True)
 
 
-def random_scene(seed: int, screen_filter: str, eps2d: float, degree: int = 3) -> HardCase:
+def random_scene(seed: int, screen_filter: str, eps2d: float) -> HardCase:
     """120 ordinary splats on white."""
-    return HardCase(crowd(120, degree, seed), view(40, 32, turned=True), Effects(degree, screen_filter, eps2d, (1.0, 1.0, 1.0)))
+    return HardCase(crowd(120, 3, seed), view(40, 32, turned=True), Effects(3, screen_filter, eps2d, (1.0, 1.0, 1.0)))
 
 
 def seen_in(viewer: Viewer, seed: int) -> HardCase:
@@ -109,24 +102,22 @@ def in_a_rounded_picture() -> HardCase:
     return HardCase(crowd(), view(), Effects(1, background=(0.2, 0.5, 0.9), settings=settings))
 
 
-def ruled(rule: RenderSettings, seed: int = 1) -> HardCase:
+def ruled(rule: RenderSettings) -> HardCase:
     """A single rule, strict enough that it affects many splats."""
-    case = random_scene(seed, "classic", DILATION)
+    case = random_scene(1, "classic", DILATION)
     return case._replace(effects=replace(case.effects, settings=rule))
 
 
 def in_buckets(settings: RenderSettings, depth: float) -> HardCase:
     """A splat behind the camera, so large or so far that the depths of all others share few buckets."""
-    case = random_scene(1, "classic", DILATION)
-    first = torch.tensor(0)
-    rows = {name: getattr(case.gaussians, name).index_put((first,), value) for name, value in _row(means=(0.0, 0.0, depth), scales=1e3).items()}
-    return HardCase(replace(case.gaussians, **rows), case.camera, replace(case.effects, settings=settings))
+    case = ruled(settings)
+    return case._replace(gaussians=_with_row(case.gaussians, 0, _row(means=(0.0, 0.0, depth), scales=1e3)))
 
 
 def with_covariances(screen_filter: str, broken: bool = False) -> HardCase:
     """A crowd with covariances in place of quaternions and scales. `broken`: one of them contains NaN."""
     gaussians = crowd()
-    matrices = covariances(gaussians)
+    matrices = covariances_of(gaussians)
     if broken:
         matrices[5, 0, 0] = math.nan
     return HardCase(replace(gaussians, covariances=matrices), view(turned=True), Effects(1, screen_filter, USUAL_EPS2D[screen_filter]))
@@ -171,9 +162,9 @@ def far_from_the_origin(shift: float = 1e6, size: float = 64.0) -> HardCase:
     return HardCase(gaussians, camera.looking_from(viewmat, ""), Effects(1))
 
 
-def long_lens(seed: int, screen_filter: str, focal: float = 171_310.0) -> HardCase:
+def long_lens(seed: int, screen_filter: str) -> HardCase:
     """One splat through a telephoto lens, 10 to 10,000 px long along each of its axes, so that it hardly varies over the image."""
-    rng = torch.Generator().manual_seed(seed)
+    rng, focal = torch.Generator().manual_seed(seed), 171_310.0  # px
     rand = partial(torch.rand, generator=rng, dtype=torch.float64)
     camera = replace(view(), fx=focal, fy=0.9 * focal)
     pixel = 3 / focal
@@ -184,6 +175,11 @@ def long_lens(seed: int, screen_filter: str, focal: float = 171_310.0) -> HardCa
 
 def _row(**values: tuple[float, ...] | float) -> dict[str, Tensor]:
     return {name: torch.tensor(value, dtype=torch.float64) for name, value in values.items()}
+
+
+def _with_row(gaussians: Gaussians, index: int, row: dict[str, Tensor]) -> Gaussians:
+    """The splats, of which one has other values."""
+    return replace(gaussians, **{name: getattr(gaussians, name).index_put((torch.tensor(index),), value) for name, value in row.items()})
 
 
 TURN = (0.8, 0.1, -0.3, 0.5)  # an ordinary quaternion, almost of norm 1
@@ -250,10 +246,13 @@ RULES = {
     "size": RenderSettings(min_variance=4.0),
     "size-along-x-and-y": RenderSettings(min_variance=4.0, boxed=True),
     "contribution": RenderSettings(min_contribution=1.5),
-    **{"spread": RenderSettings(least_spread=3.0), "level-spread": RenderSettings(least_spread=3.0, level_below=1.0)},
+    "spread": RenderSettings(least_spread=3.0),
+    "level-spread": RenderSettings(least_spread=3.0, level_below=1.0),
     "largest-color": RenderSettings(max_color=0.6),
-    **{"distance": RenderSettings(radial=True), "linear-light": RenderSettings(linear_light=2.2)},
-    **{"frame": RenderSettings(frame=0.7, frozen_beyond=math.inf), "frozen-by-width": RenderSettings(frozen_beyond=0.0, frozen_by_width=True)},
+    "distance": RenderSettings(radial=True),
+    "linear-light": RenderSettings(linear_light=2.2),
+    "frame": RenderSettings(frame=0.7, frozen_beyond=math.inf),
+    "frozen-by-width": RenderSettings(frozen_beyond=0.0, frozen_by_width=True),
     "half-axis": RenderSettings(radius=2.0, max_half_axis=5.0),
     "half-axis-of-the-whole": RenderSettings(radius=2.0, max_half_axis=5.0, boxed=True),
     "picture-size": RenderSettings(radius=20.0, fits_picture=True),

@@ -20,7 +20,7 @@ TINY = np.finfo(np.float64).tiny
 
 
 def ranks(means: np.ndarray, scales: np.ndarray, camera: Camera) -> np.ndarray:
-    """As `buckets.ranks`: [N] int32 for float32 means and scales [N, 3]."""
+    """As `buckets.ranks`, for one camera: [N] int32 for float32 means and scales [N, 3]."""
     found = np.empty(len(means), np.int32)
     if not len(means):
         return found

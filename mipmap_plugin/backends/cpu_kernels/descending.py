@@ -13,15 +13,11 @@ from torch import Tensor
 
 from mipmap_plugin.backends.base import AdamStep
 from mipmap_plugin.backends.cpu_kernels import adam
-from mipmap_plugin.backends.cpu_kernels.drawing import Drawing, add_views
+from mipmap_plugin.backends.cpu_kernels.drawing import ROWS, Drawing, add_views
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH
 from mipmap_plugin.backends.cpu_kernels.records import SplatArrays
 from mipmap_plugin.backends.cpu_kernels.threads import team
 from mipmap_plugin.process.pool import empty
-
-# Rows that are moved at a time. Their gradients, 236 bytes each, stay in the cache from view to view; a quarter as many take 3 % longer on small
-# scenes, for they need more calls, and as long on large ones.
-ROWS = 1 << 13
 
 
 def descend(splats: SplatArrays, views: Sequence[tuple[Drawing, np.ndarray]], step: AdamStep) -> None:
@@ -44,12 +40,12 @@ def descend(splats: SplatArrays, views: Sequence[tuple[Drawing, np.ndarray]], st
     threads.share(move, count, of_rows=True)
 
 
-def activated(raw: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
-    """The activated splats of raw parameters, by the names of `Gaussians`. They share means and coefficients with these."""
+def activated(raw: Mapping[str, Tensor]) -> SplatArrays:
+    """The activated splats of raw parameters. They share means and coefficients with these."""
     given = _arrays(raw)
     splats = given._replace(quats=np.empty_like(given.quats), scales=np.empty_like(given.scales), opacities=np.empty_like(given.opacities))
     team(len(given.means)).share(adam.activate_rows, len(given.means), given, splats, of_rows=True)
-    return {name: array for name, array in splats._asdict().items() if name != "covariances"}
+    return splats
 
 
 class _Room:

@@ -22,8 +22,8 @@ from mipmap_plugin.splatting.projection import slope_limits
 
 SAMPLING = {"analytic": OVER_PIXEL, "window": OVER_WINDOW}
 
-
-# Splats whose gradients are summed over the views at a time: their gradients, 236 bytes each, stay in the cache meanwhile.
+# Splats whose gradients are summed over the views at a time: their gradients, 236 bytes each, stay in the cache from view to view. A quarter as many
+# take 3 % longer on small scenes, for they need more calls, and as long on large ones.
 ROWS = 1 << 13
 
 
@@ -68,7 +68,7 @@ def project(splats: SplatArrays, shots: Sequence[Shot], *, gradients: bool = Tru
     views = [view_of(shot.camera, shot.effects, splats, gradients) for shot in shots]
     projected = [sorting.Projected.of(count, shot.camera.size) for shot in shots]
     jobs = [(count, (flags, view, splats, *of.arrays)) for (view, flags), of in zip(views, projected, strict=True)]
-    _team_for(projected).share_all(projection.project, jobs, of_rows=True)
+    team_for(projected).share_all(projection.project, jobs, of_rows=True)
     projected = [of if shot.ranks is None else of._replace(order=shot.ranks) for shot, of in zip(shots, projected, strict=True)]
     return [Projection(shot, view, flags, of) for shot, (view, flags), of in zip(shots, views, projected, strict=True)]
 
@@ -76,13 +76,14 @@ def project(splats: SplatArrays, shots: Sequence[Shot], *, gradients: bool = Tru
 def draw_projected(projections: Sequence[Projection]) -> list[Drawing]:
     """The rest of `draw`."""
     projected = [each.splats for each in projections]
-    threads = _team_for(projected)
+    threads = team_for(projected)
     drawings = [_blank(each, lists) for each, lists in zip(projections, sorting.tile_lists(projected, threads), strict=True)]
     _composite(drawings, threads)
     return drawings
 
 
-def _team_for(projected: Sequence[sorting.Projected]) -> Team:
+def team_for(projected: Sequence[sorting.Projected]) -> Team:
+    """The threads that pay for these views."""
     return team(sum(len(of.table) + of.size[0] * of.size[1] for of in projected))
 
 

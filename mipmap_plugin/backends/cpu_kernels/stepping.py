@@ -11,27 +11,23 @@ from torch import Tensor
 
 from mipmap_plugin.backends.base import AdamStep, Rendered
 from mipmap_plugin.backends.cpu_kernels import ahead, descending, drawing
-from mipmap_plugin.backends.cpu_kernels.records import SplatArrays
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.render_settings import RenderSettings
 
-# Splats and effects -> BackendUnavailable, if they cannot be drawn.
-Refuse = Callable[[Gaussians, Effects], None]
+# Raises BackendUnavailable for splats and effects that cannot be drawn.
+Require = Callable[[Gaussians, Effects], None]
 
-# Splats, a camera and settings -> the splats' ranks, by which they are sorted; None where that is by their depths.
-Ranks = Callable[[Gaussians, Camera, RenderSettings], Any]
+# Splats, a camera and effects -> the splats' ranks, by which they are sorted; None where that is by their depths.
+Ranks = Callable[[Gaussians, Camera, Effects], Any]
 
 
 class CpuStepper:
     """See `base.Stepper`. It keeps the activated splats from step to step: the kernel that moves a row activates it anew."""
 
-    def __init__(self, raw: Mapping[str, Tensor], refuse: Refuse, ranks: Ranks) -> None:
-        activated, self._refuse, self._ranks = descending.activated(raw), refuse, ranks
-        self._gaussians = Gaussians(**{name: torch.from_numpy(array) for name, array in activated.items()})
-        self._splats = SplatArrays(**activated, covariances=np.empty((0, 3, 3), np.float32))
-        self._known: set[Effects] = set()  # that were not refused
+    def __init__(self, raw: Mapping[str, Tensor], require: Require, ranks: Ranks) -> None:
+        self._splats, self._require, self._ranks = descending.activated(raw), require, ranks
+        self._gaussians = Gaussians(*(torch.from_numpy(array) for array in self._splats[:-1]))  # without covariances
         self._projected: dict[tuple[int, Camera], drawing.Projection] = {}  # the views of a step, by their numbers
         self._drawn: dict[int, drawing.Drawing] = {}  # and what is drawn of them
         self._tables: dict[int, np.ndarray] = {}  # and their gradient tables
@@ -42,11 +38,9 @@ class CpuStepper:
         self._projected = {(number, each.shot.camera): each for number, each in enumerate(projected)}
 
     def _shot(self, camera: Camera, effects: Effects) -> drawing.Shot:
-        if effects not in self._known:
-            self._refuse(self._gaussians, effects)
-            ahead.start(False, effects)  # the backward pass is compiled while the forward pass is
-            self._known.add(effects)
-        return drawing.Shot(camera, effects, self._ranks(self._gaussians, camera, effects.settings))
+        self._require(self._gaussians, effects)
+        ahead.start(False, effects)  # the backward pass is compiled while the forward pass is
+        return drawing.Shot(camera, effects, self._ranks(self._gaussians, camera, effects))
 
     def render(self, number: int, camera: Camera, effects: Effects) -> Rendered:
         projected = self._projected.pop((number, camera), None)

@@ -5,10 +5,10 @@
 
 import numpy as np
 
-from mipmap_plugin.backends.cpu_kernels import inner, integrals, kernel, layout, projection, sorting
+from mipmap_plugin.backends.cpu_kernels import inner, integrals, kernel, layout, sorting
 from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA
 from mipmap_plugin.backends.cpu_kernels.compositing import init_tile, log_alpha, tile_box, unfinished_patches
-from mipmap_plugin.backends.cpu_kernels.drawing import view_of
+from mipmap_plugin.backends.cpu_kernels.drawing import Shot, project, team_for
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, broadcast, fma, lowest_bit, minimum, select
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, row_of, store
 from mipmap_plugin.backends.cpu_kernels.patches import BATCH, find_patches, new_found
@@ -16,7 +16,6 @@ from mipmap_plugin.backends.cpu_kernels.planes import TRANSMITTANCE, distances, 
 from mipmap_plugin.backends.cpu_kernels.powers import exp2
 from mipmap_plugin.backends.cpu_kernels.records import Limits, SplatArrays
 from mipmap_plugin.backends.cpu_kernels.sums import total
-from mipmap_plugin.backends.cpu_kernels.threads import team
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.process.pool import empty
@@ -25,14 +24,12 @@ from mipmap_plugin.render_settings import MIN_ALPHA
 
 def weigh(splats: SplatArrays, camera: Camera, effects: Effects, ranks: np.ndarray | None = None) -> np.ndarray:
     """The sum of each splat's blend weights over the pixels of an image, [N] float32. Arguments: as of `drawing.draw`; not for windows."""
-    view, flags = view_of(camera, effects, splats, False)
-    limits = Limits(*effects.settings.divisible, 0.0)
-    count, (height, width) = len(splats.means), camera.size
-    projected, threads = sorting.Projected.of(count, camera.size), team(count + width * height)
-    threads.share(projection.project, count, flags, view, splats, *projected.arrays, of_rows=True)
-    [lists] = sorting.tile_lists([projected if ranks is None else projected._replace(order=ranks)], threads)
+    [projection] = project(splats, [Shot(camera, effects, ranks)], gradients=False)
+    count, projected, limits = len(splats.means), projection.splats, Limits(*effects.settings.divisible, 0.0)
+    threads = team_for([projected])
+    [lists] = sorting.tile_lists([projected], threads)
     by_pair, by_splat = empty(len(lists.members)), empty(count)
-    threads.share(weigh_tiles, len(lists.starts) - 1, flags.integrated, limits, projected.table, lists, (width, height), by_pair)
+    threads.share(weigh_tiles, len(lists.starts) - 1, projection.flags.integrated, limits, projected.table, lists, projected.size, by_pair)
     threads.share(sum_pairs, count, lists.firsts, by_pair, by_splat, of_rows=True)
     return by_splat
 
@@ -42,7 +39,7 @@ def weigh_tiles(start, stop, integrated, limits, table, lists, size, by_pair):
     """Write the weight of each pair of the tiles start..stop to its slot. integrated: as of `compositing.composite`."""
     sorting.sort(start, stop, lists)
     starts, members, slots, patches = lists.starts, pointer(lists.members), lists.slots, pointer(lists.patches)
-    width, height = size
+    height, width = size
     state, found = new_state(), new_found()
     for tile in range(start, stop):
         box, first = tile_box(tile, width, height), starts[tile]

@@ -50,8 +50,7 @@ class TritonStepper:
             return [Shot(*shot) for shot in shots]
         splats = self._splats
         activated = Gaussians(splats.means, splats.quats, splats.scales.exp(), splats.opacities.sigmoid(), splats.sh)
-        ranks = ranks_of_views(activated, [(camera, effects.settings) for camera, effects in shots])
-        return [Shot(*shot, own) for shot, own in zip(shots, ranks, strict=True)]
+        return [Shot(*shot, ranks) for shot, ranks in zip(shots, ranks_of_views(activated, shots), strict=True)]
 
     def differentiate(self, number: int, d_image: Tensor, d_alpha: Tensor | None = None) -> None:
         self.differentiate_all([d_image], None if d_alpha is None else [d_alpha], number)
