@@ -136,7 +136,7 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
     absent, passed_over, trained = 0, 0, {place_of(str(name)) for name in names} if isinstance(names := data.get("train_filenames"), list) else None
     tests = tests if isinstance(tests := data.get("test_frames"), list) else []  # of ScanNet++
     every = [*frames, *tests]
-    images, copies = listed_images(file, [_listed(frame, f"{file}, frame {index}") for index, frame in enumerate(every)])
+    images, elsewhere, copies = listed_images(file, [_listed(frame, f"{file}, frame {index}") for index, frame in enumerate(every)])
     for index, (frame, image) in enumerate(zip(every, images, strict=True)):
         where, listed = f"{file}, frame {index}", str(frame["file_path"])
         values = values_of(data, frame)
@@ -159,8 +159,7 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
     unsized = absent - sum(image is None for _, image, _ in views)
     notes = [f"{file.name}: {_counted(absent)} {ABSENT}{_left_out(unsized)}"] if absent else []
     notes += note_on_shapes(shapes)
-    if copies:
-        notes.append(f"{file.name}: the images that it lists are not there, and the photographs are those of {copies}")
+    notes += [elsewhere] if elsewhere else []
     if passed_over:
         notes.append(f"{file.name}: the intrinsics of {passed_over} of its frames are passed over for those of the file, as in nerfstudio")
     if masked := sum(bool(frame.get("mask_path")) for frame in frames):
