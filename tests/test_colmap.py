@@ -97,6 +97,22 @@ def test_names_of_images_may_have_blanks(tmp_path):
     }  # fmt: skip
 
 
+def test_a_text_model_without_lines_of_points_is_refused(tmp_path):
+    """pycolmap reads every other of its images."""
+    write_text_model(tmp_path / "sparse/0", names(4))
+    images = tmp_path / "sparse/0/images.txt"
+    images.write_text(images.read_text().replace("\n\n", "\n"))
+    with pytest.raises(SceneError, match=r"images.txt, image 1: has no line of points below it; add one, which may be empty, below every image"):
+        load_scene(tmp_path)
+
+
+def test_a_model_that_lacks_a_file_names_it(tmp_path):
+    write_text_model(tmp_path / "sparse/0", names(2))
+    (tmp_path / "sparse/0/points3D.txt").unlink()
+    with pytest.raises(SceneError, match=r"sparse/0: lacks points3D.txt, without which pycolmap reads no model; copy the whole folder"):
+        load_scene(tmp_path)
+
+
 def test_every_eighth_of_the_sorted_names_is_a_test_view(tmp_path):
     write_text_model(tmp_path / "sparse/0", names(20))
     scene = load_scene(tmp_path)

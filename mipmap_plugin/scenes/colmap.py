@@ -168,6 +168,9 @@ def _read(path: Path) -> pycolmap.Reconstruction:
     folder = _model_folder(path)
     if folder is None:
         raise SceneError(f"{path}: holds no COLMAP model (sparse/0 with cameras, images and points3D); give the folder that does")
+    suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
+    if lacking := [name for name in (f"images{suffix}", f"points3D{suffix}") if not (folder / name).is_file()]:
+        raise SceneError(f"{folder}: lacks {' and '.join(lacking)}, without which pycolmap reads no model; copy the whole folder, or export it again")
     refuse_truncated(folder)
     try:
         model = pycolmap.Reconstruction(folder)
@@ -178,13 +181,19 @@ def _read(path: Path) -> pycolmap.Reconstruction:
 
 
 def _whole_names(path: Path) -> dict[int, str]:
-    """The names of a text model's images, by their numbers: COLMAP writes them whole, and pycolmap reads them up to the first blank."""
+    """The names of a text model's images, by their numbers: COLMAP writes them whole, and pycolmap reads them up to the first blank.
+
+    Raises SceneError if images have no lines of points, without which pycolmap takes every other image for such a line.
+    """
     folder = _model_folder(path) or path
     if (folder / "images.bin").is_file():  # which has no such text, and is read where there are both
         return {}
     with (folder / "images.txt").open(encoding="utf-8") as lines:
         rows = (line.strip() for line in lines)
         found = [(row, next(rows, "")) for row in rows if row and not row.startswith("#")]  # an image, and its points on the next line
+    if lost := next((row for row, points in found if len(points.split()) % 3), None):  # each point is x, y and its number
+        where = f"{folder / 'images.txt'}, image {lost.split()[0]}"
+        raise SceneError(f"{where}: has no line of points below it; add one, which may be empty, below every image, or export the model again")
     fields = [row.split(maxsplit=9) for row, _ in found]
     return {int(row[0]): row[9] for row in fields if len(row) > 9}
 
