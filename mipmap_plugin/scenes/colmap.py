@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from itertools import count
@@ -14,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import SceneError, brief, plural, some_of
+from mipmap_plugin.errors import SceneError, brief, plural, some_of, warn
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import pixels
 from mipmap_plugin.scenes.base import ABSENT, SPLIT, Scene, note_on_shapes, other_shape
@@ -126,7 +125,7 @@ def _warn_of_larger(path: Path, read: int) -> None:
     count, largest = max(((_count(model), model) for model in others), key=lambda found: found[0], default=(0, first))
     if count > read:
         advice = f"{largest} has {count}: if a checkpoint was trained on that, give that folder"
-        warnings.warn(f"{first} is read, which has {read} images, but {advice}", stacklevel=5)
+        warn(f"{first} is read, which has {read} images, but {advice}")
 
 
 def _count(model: Path) -> int:
