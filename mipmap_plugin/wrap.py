@@ -24,7 +24,7 @@ from mipmap_plugin.frozen_base import RenderOptions as RenderOptions
 from mipmap_plugin.levels.finished import Ladder
 from mipmap_plugin.limits import check_background, check_kinds, check_names, path_of
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.adapted_scale import exporter, known_up
+from mipmap_plugin.models.adapted_scale import REMEDIES, exporter, known_up
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
@@ -123,7 +123,7 @@ def _found(model: SplatModel, cameras: Sequence[Camera] | Scene | str | Path | N
     if isinstance(cameras, Scene):
         if cameras.is_capture and (project := exporter(model.source)):
             frames = f"{model.source} is in the frame that {project} trained in, and {cameras.source} most often in another: views may show nothing"
-            warn(f"{frames}; adapt the folder of the run, which has its checkpoint and options, with these cameras")
+            warn(f"{frames}; {REMEDIES[project]}")
         return cameras, where(cameras.source, model.folder)
     if cameras is not None:
         return of_base_scale(cameras), {}

@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -55,6 +56,34 @@ def test_a_camera_is_where_colmap_says(tmp_path):
     assert torch.equal(scene.points, torch.tensor([[0.0, 2, 3], [1, 2, 3], [2, 2, 3]], dtype=torch.float64))
 
 
+def test_a_model_by_another_number_is_read_where_there_is_no_0(tmp_path):
+    """People delete the small sparse/0 that COLMAP's mapper made first."""
+    write_text_model(tmp_path / "sparse/1", names(2))
+    write_photographs(tmp_path / "images", names(2))
+    for given in (tmp_path, tmp_path / "sparse", tmp_path / "sparse/1"):
+        assert len(load_scene(given).images) == 2
+
+
+def test_a_larger_model_than_that_which_is_read_is_named(tmp_path):
+    """COLMAP numbers its models as it begins them; 3DGS, gsplat and nerfstudio take sparse/0, Brush the largest."""
+    for number, images in enumerate((3, 2, 5)):
+        write_text_model(tmp_path / f"sparse/{number}", names(images))
+    pycolmap.Reconstruction(tmp_path / "sparse/2").write_binary(tmp_path / "sparse/2")
+    with pytest.warns(UserWarning, match=r"sparse/0 is read, which has 3 images, but .*sparse/2 has 5: .* give that folder"):
+        assert len(load_scene(tmp_path).cameras) == 3
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(load_scene(tmp_path / "sparse/2").cameras) == 5
+
+
+@pytest.mark.parametrize(("folder", "prefix"), [("images", "images/"), (".", "")])
+def test_photographs_are_found_from_the_folder_above_images(tmp_path, folder, prefix):
+    """COLMAP may have been run on that, or a program may write the model beside the photographs."""
+    write_text_model(tmp_path / "desk", [f"{prefix}{name}" for name in names(2)])
+    write_photographs(tmp_path / "desk" / folder, names(2))
+    assert len(load_scene(tmp_path / "desk").images) == 2
+
+
 def test_names_of_images_may_have_blanks(tmp_path):
     """In COLMAP's text too, where they are the rest of the line; below each image are its points, of which there may be none."""
     photographs = ["my photo  1.png", "left/my photo 2.png", "3.png"]
@@ -66,6 +95,22 @@ def test_names_of_images_may_have_blanks(tmp_path):
     assert {camera.name: file.name for camera, file in scene.images.items()} == {
         "3": "3.png", "left/my photo 2": "my photo 2.png", "my photo  1": "my photo  1.png",
     }  # fmt: skip
+
+
+def test_a_text_model_without_lines_of_points_is_refused(tmp_path):
+    """pycolmap reads every other of its images."""
+    write_text_model(tmp_path / "sparse/0", names(4))
+    images = tmp_path / "sparse/0/images.txt"
+    images.write_text(images.read_text().replace("\n\n", "\n"))
+    with pytest.raises(SceneError, match=r"images.txt, image 1: has no line of points below it; add one, which may be empty, below every image"):
+        load_scene(tmp_path)
+
+
+def test_a_model_that_lacks_a_file_names_it(tmp_path):
+    write_text_model(tmp_path / "sparse/0", names(2))
+    (tmp_path / "sparse/0/points3D.txt").unlink()
+    with pytest.raises(SceneError, match=r"sparse/0: lacks points3D.txt, without which pycolmap reads no model; copy the whole folder"):
+        load_scene(tmp_path)
 
 
 def test_every_eighth_of_the_sorted_names_is_a_test_view(tmp_path):

@@ -30,7 +30,7 @@ LINK = re.compile(r"\]\(([^)\s]+)\)")
 OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]*")
 
 OTHER_PROGRAMS = {"pip", "python", "pytest", "ruff", "mypy", "npm", "mkdocs", "dask", "sbatch"}
-OPTIONS_OF_OTHERS = {"--train_test_exp", "--antialiasing", "--resources"}  # INRIA's; dask's
+OPTIONS_OF_OTHERS = {"--train_test_exp", "--antialiasing", "--resources", "--keep-crs"}  # INRIA's; dask's; OpenSplat's
 
 
 HELP = [Piece(ROOT / "mipmap_plugin/cli.py", f"mipmap-plugin {name} {words}") for name, words in cli.EXAMPLES.items()]

@@ -48,9 +48,12 @@ def present(entry: Mapping[str, Any], key: str, where: str) -> Any:
 
 
 def numbers(value: Any, shape: tuple[int, ...], where: str) -> Tensor:
-    """`value` as a finite float64 tensor of `shape`. Raises SceneError, beginning with `where`."""
+    """`value` as a finite float64 tensor of `shape`. Raises SceneError, beginning with `where`.
+
+    A single number may be a text: until May 2024 nerfstudio so wrote the lenses that it took from RealityCapture.
+    """
     try:
-        tensor = torch.tensor(value, dtype=torch.float64)
+        tensor = torch.tensor(float(value) if isinstance(value, str) else value, dtype=torch.float64)
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # torch raises different exceptions for ragged, textual and missing values
         raise SceneError(f"{where}: is not made of numbers; export the file again") from error
     if tuple(tensor.shape) != shape:

@@ -27,6 +27,9 @@ OPTIONS = "cfg_args"
 # The names of the files of a COLMAP model.
 COLMAP_FILES = {f"{name}{suffix}" for name in ("cameras", "images", "points3D", "frames", "rigs") for suffix in (".bin", ".txt")}
 
+# Files by which captures are known that no training of splats takes as they are, and what made them.
+RAW = {"keyframes/*cameras": "Polycam", "rgbd/0.*": "Record3D", "depth/0.exr": "Record3D"}
+
 __all__ = [
     "DEFORMABLE", "Scene", "cameras_in", "jittered", "load_photographs", "load_scene", "model_cameras", "orbit", "read_cameras", "read_colmap",
     "read_transforms", "unread_cameras", "write_cameras",
@@ -61,6 +64,9 @@ def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         return read_hypernerf(path, cfg)
     if is_colmap(path):
         return read_colmap(path, cfg)
+    if maker := next((maker for files, maker in RAW.items() if any(path.glob(files))), None):
+        advice = "give what the checkpoint was trained on, such as the folder with a transforms.json that ns-process-data makes of it"
+        raise SceneError(f"{path}: is a capture as {maker} exports it, whose cameras are not read here; {advice}")
     advice = f"give the folder or file that has the cameras{f', such as {found[0]}' if (found := _near(path)) else ''}"
     raise SceneError(f"{path}: holds neither cameras.json nor transforms files nor a COLMAP model; {advice}")
 
@@ -115,9 +121,9 @@ def _of_file(path: Path, cfg: dict[str, Any] | None) -> Scene:
 
 
 def _near(path: Path) -> list[Path]:
-    """Folders with cameras one level above or below a folder: of a COLMAP scene people give `images`, or what holds several scenes."""
+    """Folders with cameras below a folder or one level above it: of a COLMAP scene people give `images`, or what holds several scenes."""
     try:
-        return [place for place in (path.parent, *sorted(path.iterdir())) if place.is_dir() and _holds_cameras(place)]
+        return [place for place in (*sorted(path.glob("*")), *sorted(path.glob("*/*")), path.parent) if place.is_dir() and _holds_cameras(place)]
     except OSError:
         return []
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -13,14 +13,14 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import SceneError, brief, plural, some_of
+from mipmap_plugin.errors import SceneError, brief, plural, some_of, warn
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import pixels
 from mipmap_plugin.scenes.base import ABSENT, SPLIT, Scene, note_on_shapes, other_shape
 from mipmap_plugin.scenes.cameras_json import TEST_EVERY, numbers_views, photographs_folder, tests_by_lod, trained_size
 from mipmap_plugin.scenes.colmap_sizes import refuse_truncated
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, note
-from mipmap_plugin.scenes.listed_images import image_file
+from mipmap_plugin.scenes.listed_images import WHOLE, image_file
 
 if TYPE_CHECKING:
     import pycolmap
@@ -38,6 +38,7 @@ UNBENT = {"n_offsets": ("SIMPLE_RADIAL",), "kplanes_config": ("SIMPLE_RADIAL", "
 def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     """The scene of a folder with `sparse/0` and images, or of the folder of the model itself.
 
+    Of several models (sparse/0, sparse/1, ...) the first is read, as by 3DGS, gsplat and nerfstudio; a larger one is warned of, for Brush takes that.
     `cfg` is the checkpoint's cfg_args: `images` names the folder of photographs and `resolution` the training size; the principal
     point is moved to the center, as projects with cfg_args do, and lenses that the project takes for pinholes are (`UNBENT`). Without it, the
     photographs in `images` are used at their full size; where only copies are there (images_4), their cameras keep the full size. A camera whose
@@ -48,7 +49,6 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     """
     path, cfg = Path(path), cfg or {}
     model = _read(path)
-    folder, is_copy = _photographs(path, photographs_folder(cfg))
     try:
         whole = _whole_names(path)
         for number, image in model.images.items():
@@ -60,6 +60,7 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         raise SceneError(f"{path}: the COLMAP model has no image with a pose; run the mapper again")
     if nameless := [image.image_id for image in images if not Path(image.name).name]:
         raise SceneError(f"{path}: image {nameless[0]} of the COLMAP model has no name; copy or export it again")
+    folder, is_copy = _photographs(path, photographs_folder(cfg), [image.name for image in images])
     cameras: list[Camera] = []
     photographs: dict[Camera, Path] = {}
     lenses: dict[Path, Lens] = {}
@@ -107,21 +108,55 @@ def is_colmap(path: Path) -> bool:
 
 
 def _model_folder(path: Path) -> Path | None:
-    places = [path / place for place in MODELS]
-    return next((place for place in places if any((place / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))), None)
+    return next(_models_of(path), None)
 
 
-def _photographs(path: Path, name: str) -> tuple[Path, bool]:
+def _models_of(path: Path) -> Iterator[Path]:
+    """The folders of the models at `path`, that which is read first: if COLMAP's mapper made several, it numbers them in no order of size."""
+    numbered = sorted((int(each.name), each) for folder in (path / "sparse", path) for each in folder.glob("[1-9]*") if each.name.isdecimal())
+    for place in (*(path / place for place in MODELS), *(place for _, place in numbered)):
+        if any((place / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+            yield place
+
+
+def _warn_of_larger(path: Path, read: int) -> None:
+    """Warn if another model at `path` states more images than the `read` ones of the first."""
+    first, *others = _models_of(path)
+    count, largest = max(((_count(model), model) for model in others), key=lambda found: found[0], default=(0, first))
+    if count > read:
+        advice = f"{largest} has {count}: if a checkpoint was trained on that, give that folder"
+        warn(f"{first} is read, which has {read} images, but {advice}")
+
+
+def _count(model: Path) -> int:
+    """How many images a model states; 0 if it does not."""
+    try:
+        if (binary := model / "images.bin").is_file():
+            with binary.open("rb") as file:
+                return int.from_bytes(file.read(8), "little")
+        with (model / "images.txt").open(encoding="utf-8", errors="replace") as lines:
+            return (1 + sum(not line.startswith("#") for line in lines)) // 2
+    except OSError:
+        return 0
+
+
+def _photographs(path: Path, name: str, listed: Sequence[str]) -> tuple[Path, bool]:
     """The folder `name` of photographs: beside the model, or above it, whichever of these folders was given. Where there is none, the folder of the
-    largest copies (images_2, images_4, ...), and True."""
+    largest copies (images_2, images_4, ...), and True. `listed`: the names of the images."""
     above = [here := (_model_folder(path) or path).absolute(), here.parent]
     while above[-1].name in BETWEEN:
         above.append(above[-1].parent)
     usual = next((place.parent for place in above if place.name == "sparse"), path)  # if there is none
     if found := next((place / name for place in above if (place / name).is_dir()), None):
-        return found, False
+        return _holding(found, listed), False
     copies = {int(match[1]): copy for place in above for copy in place.glob("images_*") if (match := re.fullmatch(r"images_(\d{1,9})", copy.name))}
-    return (copies[min(copies)], True) if copies else (usual / name, False)
+    return (copies[min(copies)], True) if copies else (_holding(usual / name, listed), False)
+
+
+def _holding(folder: Path, listed: Sequence[str]) -> Path:
+    """`folder`, or the one above if only that has images listed so: their names may begin with `images/`, or they lie beside the model's files."""
+    places = (folder, folder.parent) if folder.name == WHOLE else ()
+    return next((place for place in places if any(image_file(place, name) for name in listed)), folder)
 
 
 def _read(path: Path) -> pycolmap.Reconstruction:
@@ -132,21 +167,32 @@ def _read(path: Path) -> pycolmap.Reconstruction:
     folder = _model_folder(path)
     if folder is None:
         raise SceneError(f"{path}: holds no COLMAP model (sparse/0 with cameras, images and points3D); give the folder that does")
+    suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
+    if lacking := [name for name in (f"images{suffix}", f"points3D{suffix}") if not (folder / name).is_file()]:
+        raise SceneError(f"{folder}: lacks {' and '.join(lacking)}, without which pycolmap reads no model; copy the whole folder, or export it again")
     refuse_truncated(folder)
     try:
-        return pycolmap.Reconstruction(folder)
+        model = pycolmap.Reconstruction(folder)
     except Exception as error:  # pycolmap passes on any C++ exception for a damaged file
         raise SceneError(f"{folder}: is not a COLMAP model that pycolmap reads ({brief(error)}); copy or export it again") from error
+    _warn_of_larger(path, len(model.images))
+    return model
 
 
 def _whole_names(path: Path) -> dict[int, str]:
-    """The names of a text model's images, by their numbers: COLMAP writes them whole, and pycolmap reads them up to the first blank."""
+    """The names of a text model's images, by their numbers: COLMAP writes them whole, and pycolmap reads them up to the first blank.
+
+    Raises SceneError if images have no lines of points, without which pycolmap takes every other image for such a line.
+    """
     folder = _model_folder(path) or path
     if (folder / "images.bin").is_file():  # which has no such text, and is read where there are both
         return {}
     with (folder / "images.txt").open(encoding="utf-8") as lines:
         rows = (line.strip() for line in lines)
         found = [(row, next(rows, "")) for row in rows if row and not row.startswith("#")]  # an image, and its points on the next line
+    if lost := next((row for row, points in found if len(points.split()) % 3), None):  # each point is x, y and its number
+        where = f"{folder / 'images.txt'}, image {lost.split()[0]}"
+        raise SceneError(f"{where}: has no line of points below it; add one, which may be empty, below every image, or export the model again")
     fields = [row.split(maxsplit=9) for row, _ in found]
     return {int(row[0]): row[9] for row in fields if len(row) > 9}
 

@@ -129,7 +129,7 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
     names, tests = data.get("train_filenames"), data.get("test_frames")  # of nerfstudio, and of ScanNet++
     trained = {place_of(str(name)) for name in names} if isinstance(names, list) else None
     every = [*frames, *(tests if isinstance(tests, list) else [])]
-    images, copies = listed_images(file, [_listed(frame, f"{file}, frame {index}") for index, frame in enumerate(every)])
+    images, elsewhere, copies = listed_images(file, [_listed(frame, f"{file}, frame {index}") for index, frame in enumerate(every)])
     for index, (frame, image) in enumerate(zip(every, images, strict=True)):
         where, listed = f"{file}, frame {index}", str(frame["file_path"])
         values = values_of(data, frame)
@@ -155,8 +155,7 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
     left_out = f"; {_are(unsized, 'camera')} left out because the file has no w and h" if unsized else ""
     notes = [f"{file.name}: {_are(absent, 'listed image')} {ABSENT}{left_out}"] if absent else []
     notes += note_on_shapes(shapes)
-    if copies:
-        notes.append(f"{file.name}: the images that it lists are not there, and the photographs are those of {copies}")
+    notes += [elsewhere] if elsewhere else []
     if passed_over:
         notes.append(f"{file.name}: the intrinsics of {passed_over} of its frames are passed over for those of the file, as in nerfstudio")
     if masked := sum(bool(frame.get("mask_path")) for frame in frames):

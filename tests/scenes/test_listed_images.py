@@ -50,6 +50,24 @@ def test_copies_do_not_tell_the_size_of_the_images(tmp_path):
         load_scene(tmp_path)
 
 
+@pytest.mark.parametrize("listed", ["/home/a/desk/images/{}.png", "C:\\Users\\a\\desk\\images\\{}.png", "data/desk/images/{}.png", "{}.png"])
+def test_images_listed_by_a_path_of_elsewhere_are_found_beside_the_file(tmp_path, listed):
+    """colmap2nerf.py of instant-ngp lists what it was given, on the computer where it ran."""
+    images = [save_image(tmp_path / f"images/{name}.png", 80, 60) for name in "ab"]
+    write_json(tmp_path / "transforms.json", {"fl_x": 70.0, "frames": [frame(file_path=listed.format(name)) for name in "ab"]})
+    scene = load_scene(tmp_path)
+    assert ([*scene.images.values()], scene.cameras[0].size) == (images, (60, 80))
+    assert scene.notes == [f"transforms.json: the images that it lists are not there, and the photographs are those of {tmp_path / 'images'}"]
+
+
+@pytest.mark.parametrize("listed", [["undistorted/a.png"], ["/home/a/undistorted/a.png"], ["/left/images/a.png", "/right/images/a.png"]])
+def test_images_by_the_same_name_of_another_folder_are_not_taken(tmp_path, listed):
+    """They may be distorted ones, or another camera's."""
+    save_image(tmp_path / "images/a.png", 80, 60)
+    write_json(tmp_path / "transforms.json", {**SIZED, "frames": [frame(file_path=path) for path in listed]})
+    assert load_scene(tmp_path).images == {}
+
+
 def test_of_several_files_without_usual_names_one_has_to_be_given(tmp_path):
     for name in ("transforms_a.json", "transforms_b.json"):
         write_json(tmp_path / name, {**SIZED, "frames": [frame()]})

@@ -91,9 +91,17 @@ def test_a_file_of_a_colmap_model_names_its_folder(tmp_path):
 def test_cameras_one_level_above_or_below_are_named(tmp_path):
     (tmp_path / "captures/desk/images").mkdir(parents=True)
     write_json(tmp_path / "captures/desk/transforms.json", {})
-    for given in ("captures", "captures/desk/images"):
+    for given in (".", "captures", "captures/desk/images"):
         with pytest.raises(SceneError, match=f"holds neither .*, such as {tmp_path / 'captures/desk'}$"):
             load_scene(tmp_path / given)
+
+
+@pytest.mark.parametrize(("file", "maker"), [("keyframes/cameras/1.json", "Polycam"), ("rgbd/0.jpg", "Record3D"), ("depth/0.exr", "Record3D")])
+def test_a_capture_that_no_training_takes_as_it_is_names_what_to_give(tmp_path, file, maker):
+    (tmp_path / file).parent.mkdir(parents=True)
+    (tmp_path / file).touch()
+    with pytest.raises(SceneError, match=f"is a capture as {maker} exports it.*give what the checkpoint was trained on, such as .* ns-process-data"):
+        load_scene(tmp_path)
 
 
 def test_an_empty_folder_is_refused(tmp_path):

@@ -214,3 +214,14 @@ def test_a_photograph_that_was_cropped_a_little_is_told_of(tmp_path):
     scene = read_transforms(write_json(tmp_path / "transforms.json", {"camera_angle_x": 0.8, "w": 40, "h": 30, "frames": [frame()]}))
     [note] = scene.warnings()
     assert "stretched to their shape, as in 3DGS (r_0.png has 40 x 28 px, its camera 40 x 30 px); if they were cropped, every figure is" in note
+
+
+def test_numbers_of_a_lens_may_be_texts(tmp_path):
+    """As `ns-process-data realitycapture` wrote them until May 2024, of images without distortion too."""
+    zero = dict.fromkeys(("k1", "k2", "k3", "k4", "p1", "p2"), "0.0")
+    path = write_json(tmp_path / "transforms.json", {"w": 80, "h": 60, "frames": [frame(fl_x=70.0, fl_y=70.0, **zero)]})
+    scene = read_transforms(path)
+    assert (scene.lenses, scene.cameras[0].fx) == ({}, 70.0)
+    bent = write_json(tmp_path / "bent.json", {"w": 80, "h": 60, "frames": [frame(fl_x=70.0, **{**zero, "k1": "wide"})]})
+    with pytest.raises(SceneError, match="k1: is not made of numbers"):
+        read_transforms(bent)
