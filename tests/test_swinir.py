@@ -88,7 +88,7 @@ def test_an_image_is_enlarged_once(swinir, tmp_path, monkeypatch):
 def test_it_is_fused_with_the_base_at_zoom_in(swinir, tmp_path):
     path = saved(tmp_path / "net.pth", swinir(2, LIGHT))
     views = tiny.cameras(2)
-    run = lambda **settings: wrap_model(tiny.model(), cameras=views).adapt(2.0, steps=2, views="given", **settings)  # noqa: E731
+    run = lambda **settings: wrap_model(tiny.model(), cameras=views).adapt(2.0, steps=2, views="given", returns="last", **settings)  # noqa: E731
     fused = run(upsampler=str(path))
     assert "net.pth fused with it" in fused.report.filters and "upsampling" in fused.report.seconds
     assert not torch.equal(fused.model.parameters()["sh0"], run().model.parameters()["sh0"])
