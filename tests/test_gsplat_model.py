@@ -17,6 +17,7 @@ from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.formats.yaml_scalars import read_scalars
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model
+from mipmap_plugin.models.adapted_name import adapted_name
 from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.wrap import wrap_model
 
@@ -153,6 +154,12 @@ def test_a_file_of_its_own_format_keeps_all_bands_and_is_not_said_to_lack_some(t
     adapted = wrap_model(gsplat_folder(tmp_path / "r", raw), cameras=tiny.cameras()).adapt(1 / 4, viewer="spark", recipe="instant")
     file = adapted.save(tmp_path / target)
     assert load_model(file).parameters()["shN"].shape[1] == 24 and not any("left out" in note for note in adapted.report_of(file).notes)
+
+
+@pytest.mark.parametrize("write", [gsplat_folder, splatfacto_folder])
+@pytest.mark.parametrize(("viewer", "ending"), [(None, ""), ("nerfstudio", "_nerfstudio"), ("spark", "_spark.ply"), ("classic", "_classic.ply")])
+def test_a_viewer_that_reads_no_file_of_its_project_gets_a_ply(tmp_path, write, viewer, ending):
+    assert adapted_name(write(tmp_path / "run", splats(4)), 1 / 4, viewer) == f"run_x0.25{ending}"
 
 
 def test_a_ply_is_written_on_request(tmp_path):

@@ -141,7 +141,7 @@ def test_a_file_for_a_viewer_is_a_ply(tmp_path):
 def test_other_files_become_a_folder(tmp_path, ending):
     """Those that a built-in family reads, and those that none does."""
     torch.save({"splats": {}}, tmp_path / f"a{ending}")
-    assert adapted_name(tmp_path / f"a{ending}", 0.25, "spark") == f"a{ending}_x0.25_spark"
+    assert adapted_name(tmp_path / f"a{ending}", 0.25, "gsplat") == f"a{ending}_x0.25_gsplat"
 
 
 def test_a_recognized_family_can_be_read_once_a_loader_is_registered(tmp_path):

@@ -15,13 +15,17 @@ from mipmap_plugin.models.zipped_folder import opened
 GLTF = (".glb", ".gltf")
 COMPRESSED = EXCHANGE["compressed"][1]
 
+# Families that are saved with torch, and the viewers that read what they save; any other needs a PLY.
+SAVED_WITH_TORCH = ("gsplat", "splatfacto")
+READ_THESE = ("gsplat", "gsplat-antialiased", "nerfstudio", "nerfstudio-antialiased")
+
 
 def adapted_name(checkpoint: Path, scale: float, viewer: str | None = None) -> str:
     """NAME_x0.25 or NAME_x0.25_spark, with the ending of what is saved; none for a folder.
 
     Exchange formats that can only be read, or have another ending, are written as a PLY, as is a PLY in a zip archive. glTF is written as .glb, but
-    as a PLY for a viewer that does not read that, and files of third-party families as these say (`Family.saves`), but as a PLY for any. Files that
-    other projects save with torch become a folder, as those of INRIA are.
+    as a PLY for a viewer that does not read that, and files of third-party families as these say (`Family.saves`), but as a PLY for any. What gsplat
+    and nerfstudio save becomes a folder of theirs, but a PLY for a viewer of others.
     """
     name = checkpoint.resolve().name
     read, written = _endings(checkpoint, name, viewer)
@@ -40,7 +44,7 @@ def _is_plain(checkpoint: Path) -> bool:
 def _endings(checkpoint: Path, name: str, viewer: str | None) -> tuple[str, str]:
     """The ending of a checkpoint's name, and that of the adapted file; "" for none."""
     if not checkpoint.is_file() and checkpoint.suffix != ".ply":
-        return "", ""
+        return "", _of_folder(checkpoint, viewer)
     if name.lower().endswith(GLTF):
         return Path(name).suffix, ".glb" if viewer is None or viewer in READ_GLB else ".ply"
     if ending := next((known for known in (*WRITTEN, ".ply", *READ_ONLY) if name.lower().endswith(known)), ""):
@@ -50,8 +54,19 @@ def _endings(checkpoint: Path, name: str, viewer: str | None) -> tuple[str, str]
     except MipmapPluginError:  # whoever loads it says so
         return "", ""
     if opened(checkpoint) != checkpoint:  # a folder in a zip archive
-        return Path(name).suffix, ""
+        return Path(name).suffix, _of_folder(checkpoint, viewer)
     if family in BUILT_IN:
-        return (Path(name).suffix, ".ply") if family.name in ("zipped", "gltf", "exchange") else ("", "")
+        written = ".ply" if family.name in ("zipped", "gltf", "exchange") else _of_folder(checkpoint, viewer)
+        return (Path(name).suffix, written) if written else ("", "")
     own = Path(name).suffix if family.saves is None else family.saves
     return Path(name).suffix, own if viewer is None else ".ply"
+
+
+def _of_folder(checkpoint: Path, viewer: str | None) -> str:
+    """The ending of what a checkpoint is saved as that otherwise becomes a folder: ".ply" for a viewer that reads no other file, or ""."""
+    if viewer is None or viewer in READ_THESE:
+        return ""
+    try:
+        return ".ply" if detect(checkpoint).family in SAVED_WITH_TORCH else ""
+    except MipmapPluginError:  # whoever loads it says so
+        return ""
