@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import tiny
-from browser import missing_browser
+from browser import Browser, missing, missing_browser
 
 from mipmap_plugin.cli import main
 
@@ -28,6 +28,15 @@ def chromium() -> Iterator[Any]:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
         yield browser
         browser.close()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    """The viewers in a browser."""
+    if lacking := missing():
+        pytest.skip(lacking)
+    with Browser() as started:
+        yield started
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
@@ -10,7 +10,7 @@ from statistics import fmean
 import numpy as np
 import pytest
 import torch
-from browser import HERE, VIEWERS, Browser, BrowserError, missing
+from browser import HERE, VIEWERS, Browser, BrowserError
 
 from mipmap_plugin import Camera, wrap_model
 from mipmap_plugin.demo.run import embedded
@@ -32,14 +32,6 @@ SURROUNDED = ALIKE_IN | {"playcanvas-webgpu": 42.0, "babylon": 42.0}
 
 # dB, in an unbounded scene: 43 in PlayCanvas on WebGPU, 42 in gsplat.js.
 UNBOUNDED = {"playcanvas-webgpu": 40.0, "gsplat-js": 40.0}
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    if lacking := missing():
-        pytest.skip(lacking)
-    with Browser() as started:
-        yield started
 
 
 @pytest.fixture

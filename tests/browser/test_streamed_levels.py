@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -74,12 +73,6 @@ def streamed(folder: Path, **options: Any) -> tuple[Path, Ladder]:
 @pytest.fixture(scope="module")
 def settings(ladder: Path) -> dict[str, Any]:
     return dict(json.loads((ladder / STREAMED / SETTINGS).read_text()))
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with Browser() as opened:
-        yield opened
 
 
 @pytest.fixture(scope="module")
