@@ -219,10 +219,10 @@ def _transforms(path: Path) -> Path:
 
 
 def _colmap(path: Path) -> Path:
+    import colmap_files
     import pycolmap
-    import test_colmap
 
-    test_colmap.write_text_model(path / "text", test_colmap.names(3))
+    colmap_files.write_text_model(path / "text", colmap_files.names(3))
     (path / "sparse/0").mkdir(parents=True)
     pycolmap.Reconstruction(path / "text").write_binary(path / "sparse/0")
     return path

@@ -8,7 +8,7 @@ import sys
 import pytest
 import tiny
 import torch
-from test_colmap import names, write_text_model
+from colmap_files import names, write_text_model
 from torch_checkpoints import gsplat_folder, splats
 
 from mipmap_plugin.adaptation.target.photographs import placed
