@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import struct
 from pathlib import Path
@@ -58,3 +59,17 @@ def write_glb(path: Path, made: dict[str, Any], data: bytes) -> Path:
 def glb(path: Path, splats: Gaussians) -> Path:
     """Write splats as one primitive of a binary glTF."""
     return write_glb(path, *document(attributes(splats)))
+
+
+# Where a primitive says how its splats are meant.
+SAID = ("meshes", 0, "primitives", 0, "extensions", EXTENSION)
+
+
+def changed(made, *path, to):
+    """A copy with another value at a place."""
+    made = copy.deepcopy(made)
+    place = made
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = to
+    return made

@@ -1,7 +1,6 @@
 """Splats in glTF are those of a PLY, turned from y up; what is not read is said in a sentence."""
 
 import base64
-import copy
 import json
 from dataclasses import replace
 
@@ -47,19 +46,6 @@ def assert_moved(read, splats, turn, size=1.0, shift=(0.0, 0.0, 0.0)):
     torch.testing.assert_close(covariances(read), size**2 * turn @ covariances(splats) @ turn.T, atol=1e-6, rtol=1e-4)
     torch.testing.assert_close(read.opacities, splats.opacities, atol=1e-5, rtol=1e-5)
     torch.testing.assert_close(towards(read, directions @ turn.T), towards(splats, directions), atol=1e-4, rtol=1e-4)
-
-
-def changed(made, *path, to):
-    """A copy with another value at a place."""
-    made = copy.deepcopy(made)
-    place = made
-    for key in path[:-1]:
-        place = place[key]
-    place[path[-1]] = to
-    return made
-
-
-SAID = ("meshes", 0, "primitives", 0, "extensions", EXTENSION)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -140,7 +126,7 @@ def test_the_drafts_sizes_are_logarithms_and_their_colors_are_called_otherwise(t
     named = gltf_files.attributes(splats)
     named[f"{EXTENSION}:SCALE"] = np.log(named[f"{EXTENSION}:SCALE"])
     made, data = gltf_files.document(named)
-    read = load_model(gltf_files.write_glb(tmp_path / "a.glb", changed(made, *SAID, "colorSpace", to=space), data)).gaussians()
+    read = load_model(gltf_files.write_glb(tmp_path / "a.glb", gltf_files.changed(made, *gltf_files.SAID, "colorSpace", to=space), data)).gaussians()
     assert_moved(read, splats, HALF_TURN)
 
 
@@ -224,7 +210,7 @@ def test_how_splats_are_to_be_drawn_is_written_and_read(tmp_path, screen_filter)
 @pytest.mark.parametrize("wrong", [7, {"SplatRenderMode": 7}, {"SplatRenderMode": "unheard"}, []])
 def test_other_facts_about_a_file_are_not_looked_at(tmp_path, wrong):
     made, data = gltf_files.document(gltf_files.attributes(tiny.gaussians()))
-    path = gltf_files.write_glb(tmp_path / "a.glb", changed(made, "asset", to={"version": "2.0", "extras": wrong}), data)
+    path = gltf_files.write_glb(tmp_path / "a.glb", gltf_files.changed(made, "asset", to={"version": "2.0", "extras": wrong}), data)
     assert load_model(path).trained == TrainedScale()
 
 
@@ -255,69 +241,3 @@ def test_a_viewer_that_does_not_read_it_is_told_of(tmp_path):
         refuse_unread(tmp_path / "a.glb", ["spark"])
     refuse_unread(tmp_path / "a.glb", ["kiosk"])  # of a package, of which nothing is known
     assert main([*words, "--viewer", "three"]) == 0 and len(load_model(tmp_path / "a.glb")) > 0
-
-
-# What is refused
-
-
-def test_meshes_without_splats(tmp_path):
-    made, data = gltf_files.document(gltf_files.attributes(tiny.gaussians()))
-    del made["meshes"][0]["primitives"][0]["extensions"]
-    assert "is glTF without Gaussian splats" in sentence(gltf_files.write_glb(tmp_path / "a.glb", made, data))
-
-
-@pytest.mark.parametrize(
-    ("path", "to", "told"),
-    [
-        ((*SAID, "kernel"), "cube", "have the kernel 'cube'"),
-        ((*SAID, "colorSpace"), "lin_rec709_display", "its colors are in 'lin_rec709_display'"),
-        (("nodes", 0, "scale"), [1, 2, 1], "stretches them unevenly"),
-        (("nodes", 0, "scale"), [-1, 1, 1], "mirrors its splats"),
-        (("nodes", 0, "scale"), [0, 0, 0], "stretches them unevenly"),
-        (("nodes", 0, "children"), [0], "lies in two others"),
-        (("accessors", 0, "sparse"), {}, "accessor 0 is sparse"),
-        (("bufferViews", 0, "extensions"), {"EXT_meshopt_compression": {}}, "compressed by meshopt"),
-        (("bufferViews", 0, "byteStride"), 0, "the rows of view 0 overlap"),
-        (("bufferViews", 0, "byteLength"), 10**9, "ends before its view 0"),
-        (("accessors", 0, "count"), 10**9, "is a damaged glTF file"),
-        (("accessors", 0, "count"), 59, "its attributes do not fit each other"),
-        (("accessors", 1, "type"), "VEC3", "its attributes do not fit each other"),
-        (("accessors", 0, "bufferView"), 99, "is a damaged glTF file"),
-        (("bufferViews", 0, "buffer"), 1, "is a damaged glTF file"),
-        (("accessors", 0, "type"), "MAT9", "which lacks 'MAT9'"),
-        (("nodes",), [{"children": [*range(1, 102)]}, *[{"mesh": 0}] * 101], "its nodes repeat splats 101 times"),
-        (("buffers", 0, "uri"), "../a.bin", "does not lie in its folder"),
-        (("buffers", 0, "uri"), "https://example.com/a.bin", "does not lie in its folder"),
-    ],
-)
-def test_what_is_not_read_is_said_in_a_sentence(tmp_path, path, to, told):
-    made, data = gltf_files.document(gltf_files.attributes(tiny.gaussians()))
-    assert told in sentence(gltf_files.write_glb(tmp_path / "a.glb", changed(made, *path, to=to), data))
-
-
-def test_a_file_of_no_splats(tmp_path):
-    assert "holds no splats" in sentence(gltf_files.glb(tmp_path / "a.glb", tiny.gaussians(0)))
-
-
-@pytest.mark.parametrize("missing", ["SH_DEGREE_1_COEF_2", "SH_DEGREE_2_COEF_0"])
-def test_degrees_have_to_be_whole(tmp_path, missing):
-    named = gltf_files.attributes(tiny.gaussians(degree=3))
-    del named[f"{EXTENSION}:{missing}"]
-    assert "its degrees of spherical harmonics are not whole" in sentence(gltf_files.write_glb(tmp_path / "a.glb", *gltf_files.document(named)))
-
-
-def test_a_tileset_names_its_tiles(tmp_path):
-    (tmp_path / "tileset.json").write_text(json.dumps({"asset": {"version": "1.1"}, "geometricError": 1, "extensionsUsed": [EXTENSION]}))
-    assert "is the tileset of 3D Tiles; give one of its tiles" in sentence(tmp_path / "tileset.json")
-
-
-def test_missing_attributes_are_named(tmp_path):
-    named = gltf_files.attributes(tiny.gaussians())
-    del named[f"{EXTENSION}:SCALE"], named[f"{EXTENSION}:OPACITY"]
-    assert "lacks SCALE, COLOR_0" in sentence(gltf_files.write_glb(tmp_path / "a.glb", *gltf_files.document(named)))
-
-
-def test_a_file_that_is_cut_off_is_damaged(tmp_path):
-    path = gltf_files.glb(tmp_path / "a.glb", tiny.gaussians())
-    path.write_bytes(path.read_bytes()[:-100])
-    assert "is a damaged glTF file" in sentence(path)

@@ -1,9 +1,7 @@
-"""Threads: results keep their order and their bits, torch gets its own back, and what takes long is announced."""
+"""Threads: results keep their order and their bits, and torch gets its own back."""
 
-import io
 import os
 import signal
-import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +12,6 @@ import torch
 from anchor_checkpoints import write
 from running import wait_until
 
-from mipmap_plugin import progress
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.commands.common import wrap
 from mipmap_plugin.errors import SettingsError
@@ -203,79 +200,6 @@ def test_what_ends_one_thread_lets_the_others_begin_nothing_more():
     with pytest.raises(KeyboardInterrupt):
         list(threads.side_by_side(interrupted, range(100), 2))
     assert len(begun) < 10
-
-
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
-@pytest.mark.parametrize("terminal, patience, line", [(True, 0.01, "merging x0.25: 00:0"), (True, 60, ""), (False, 0.01, "")])
-def test_long_work_is_announced_on_a_terminal_alone(terminal, patience, line, monkeypatch):
-    errors = Terminal() if terminal else io.StringIO()
-    monkeypatch.setattr(sys, "stderr", errors)
-    monkeypatch.setattr(progress, "PATIENCE", patience)
-    monkeypatch.setattr(progress, "PERIOD", 0.01)
-    with progress.announced("merging x0.25"):
-        time.sleep(0.2 if patience < 1 else 0)
-    assert line in errors.getvalue() and bool(errors.getvalue()) == bool(line)
-
-
-class Log:
-    """What a program may put in the place of standard error, to have it in a file of its own."""
-
-    written = ""
-
-    def write(self, text):
-        self.written += text
-
-
-def closed():
-    stream = io.StringIO()
-    stream.close()
-    return stream
-
-
-@pytest.mark.parametrize("stream", [None, Log(), closed()])
-def test_a_program_without_a_standard_error_adapts(stream, tmp_path, monkeypatch):
-    """As one that runs in the background, or without a window."""
-    monkeypatch.setattr(sys, "stderr", stream)
-    wrapped = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="cpu", threads=1)
-    adapted = wrapped.adapt(1 / 2, steps=1, extra_views=2, validation_views=2)
-    assert list(progress.counted([adapted.save(tmp_path / "new.ply")], 1, "saving", "file"))
-    assert not getattr(stream, "written", "")
-
-
-def test_what_takes_seconds_of_a_large_scene_is_announced(tmp_path, monkeypatch):
-    told = []
-    monkeypatch.setattr(sys, "stderr", Terminal())
-    monkeypatch.setattr(progress, "_show", lambda what, ended: told.append(what))
-    wrapped = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="cpu", threads=1)
-    wrapped.adapt(1 / 2, recipe="instant").save(tmp_path / "new.ply")
-    assert {"examining views", "writing new.ply"} <= set(told)
-
-
-def test_the_clock_of_a_bar_goes_on_while_nothing_is_counted(monkeypatch):
-    monkeypatch.setattr(progress, "PATIENCE", 0.01)
-    monkeypatch.setattr(sys, "stderr", errors := Terminal())
-    with progress.Bar(total=2) as bar, progress.ticking(bar):
-        shown = errors.getvalue()
-        wait_until(lambda: errors.getvalue() != shown)
-    monkeypatch.setattr(sys, "stderr", silent := io.StringIO())
-    with progress.Bar(total=2) as bar, progress.ticking(bar):
-        time.sleep(0.05)
-    assert not silent.getvalue()
-
-
-def test_a_terminal_that_knows_no_size_shows_bars(monkeypatch):
-    """As a serial line does: tqdm takes one of 0 lines for one without room."""
-    pytest.importorskip("termios")
-    ours, theirs = os.openpty()
-    with open(theirs, "w") as terminal, open(ours, "rb"):
-        monkeypatch.setattr(sys, "stderr", terminal)
-        assert os.get_terminal_size(theirs) == (0, 0)
-        assert list(progress.counted(range(3), 3, "counting", "thing")) == [0, 1, 2]
-        assert b"counting: 100%" in os.read(ours, 4096)
 
 
 @pytest.mark.parametrize("wrong", [0, -1, 1.5, 10**9])
