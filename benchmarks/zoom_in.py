@@ -32,11 +32,11 @@ transformers, realesr-animevideov3.pth is a GAN that is worse in dB than bicubic
 no splat touched. Seconds on one thread of a shared machine, those to enlarge the views among them (about 1 s a view with a transformer,
 and an empty cache).
 
-The *base* as it is has 6 to 7.5 dB less than `default`, and better LPIPS than many, for its needles are crisp. The setting `crispness` leads from
-the closed form of most dB (0, `instant`) to splats as small as the base's own, which are more opaque instead of wider (1); steps that start
-there keep their crispness. 0.5, which `default` has, gains dB and LPIPS over 0 at both scales of both bases; 1 loses neither against the base
-(the shaded side). Rows with networks, which begin at 0, are of a version that widened splats for their closest view; by hand
-`thorough + X2.pt` of lego and chair is within 0.1 dB and 0.001 of LPIPS of it.
+The *base* as it is has 6 to 7.5 dB less than `default`. Its needles are crisp: at x4 nothing without a network has its LPIPS (the shaded
+side). The setting `crispness` leads from wider splats (0) to more opaque ones (1), as far as their opacity can rise; steps that start there
+keep their crispness. `instant` has 0.5 and `default` 0.75, the most dB or 0.02 less; the more, the better LPIPS. Rows with networks, which
+begin at 0, are of a version that widened splats for their closest view; by hand `thorough + X2.pt` of lego and chair is within 0.1 dB and
+0.001 of LPIPS of it.
 
 ![dB against LPIPS](zoom_in.png)
 

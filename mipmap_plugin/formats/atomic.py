@@ -31,7 +31,8 @@ def together(path: Path, spent: Iterable[Path] = ()) -> Iterator[None]:
     """Make everything that the block writes to, into or beside `path` one atomic output: it appears if the block succeeds.
 
     `spent`: files and folders, such as the state of the run, that are removed with that, and else stay. A process that is killed while several
-    files are moved into place leaves a record, from which the next run that writes to `path` or loads it completes all this (`staging`).
+    files are moved into place leaves a record, from which the next run that writes to `path` or loads it moves the others, and removes what is
+    spent beside `path` (`staging`).
     Raises OutputError.
     """
     with _as_output_error(path):

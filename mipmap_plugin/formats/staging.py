@@ -8,6 +8,7 @@ or a system that cannot exchange folders), `new` is first renamed to `ready`: fr
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import errno
 import os
@@ -173,7 +174,10 @@ def _locked(lock: int, made: bool) -> bool:
 
 def _is_of(lock: int, folder: Path) -> bool:
     """Whether the folder is the one of this descriptor, and not another one that has got its name since."""
-    return os.path.lexists(folder) and os.path.samestat(os.fstat(lock), os.stat(folder))
+    try:
+        return os.path.samestat(os.fstat(lock), os.stat(folder))
+    except FileNotFoundError:
+        return False
 
 
 def _is_stale(folder: os.stat_result) -> bool:
@@ -237,7 +241,8 @@ def _remove(path: Path, folder: Path) -> None:
         (folder / "removed").mkdir(exist_ok=True)
         os.rename(path, folder / "removed" / path.name)
     except OSError:  # on another disk
-        path.unlink(missing_ok=True) if not path.is_dir() or path.is_symlink() else shutil.rmtree(path, ignore_errors=True)
+        with contextlib.suppress(OSError):  # the output is in its place, whatever stays
+            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
 def _finish(folder: Path, lock: int) -> None:
