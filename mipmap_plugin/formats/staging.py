@@ -8,7 +8,6 @@ or a system that cannot exchange folders), `new` is first renamed to `ready`: fr
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import errno
 import os
@@ -241,7 +240,7 @@ def _remove(path: Path, folder: Path) -> None:
         (folder / "removed").mkdir(exist_ok=True)
         os.rename(path, folder / "removed" / path.name)
     except OSError:  # on another disk
-        with contextlib.suppress(OSError):  # the output is in its place, whatever stays
+        with suppress(OSError):  # the output is in its place, whatever stays
             shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
