@@ -235,6 +235,18 @@ def test_runs_with_one_output_keep_their_states_in_files_of_their_own(tmp_path, 
     assert sorted(path.name for path in tmp_path.iterdir() if "state" in path.name) == []
 
 
+def test_a_run_that_is_saved_again_leaves_the_state_of_the_next_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(resume, "SAVE_EVERY_S", 0.0)
+    model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2)), tmp_path / "state"
+    first = model.adapt(1 / 4, steps=1, resume=state)
+    first.save(tmp_path / "one.ply")
+    second = model.adapt(1 / 4, steps=2, resume=state)
+    first.save(tmp_path / "copy.ply")
+    assert {path.name for path in tmp_path.iterdir() if "state" in path.name} == {"state", ".state.lock"}
+    second.save(tmp_path / "two.ply")
+    assert not state.exists()
+
+
 def test_each_interrupted_run_goes_on_from_its_own_state(tmp_path, monkeypatch):
     monkeypatch.setattr(resume, "SAVE_EVERY_S", 0.0)
     model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2)), tmp_path / "state"

@@ -20,8 +20,8 @@ class StateFile:
 
     @property
     def files(self) -> list[Path]:
-        """The state and its lock."""
-        return [self.path, _lock_of(self.path)]
+        """The state and its lock, while they are this run's; none once they are released, as others may be there then."""
+        return [] if self._lock is None else [self.path, _lock_of(self.path)]
 
     def remove(self) -> None:
         """Delete the state, which is no longer needed."""
