@@ -20,7 +20,7 @@ from mipmap_plugin.levels.contents import Contents, CurvePoint, LeftOut, Level, 
 from mipmap_plugin.levels.distance.ladder import by_distance, make_levels_by_distance
 from mipmap_plugin.levels.finished import Ladder
 from mipmap_plugin.levels.manifest import write_ladder
-from mipmap_plugin.levels.request import FINEST_RATIO, MERGING_COSTS, MOST_LOST, SAME, Band, LadderRequest
+from mipmap_plugin.levels.request import FINEST_RATIO, MOST_LOST, SAME, Band, LadderRequest
 from mipmap_plugin.levels.store import LevelStore
 from mipmap_plugin.levels.switching import EVEN, switching_zoom, zooms_between
 from mipmap_plugin.levels.yardstick import Yardstick
@@ -110,8 +110,8 @@ class _Work:
     def _below(self, finer: Level, name: str, band: Band, arguments: dict[str, Any]) -> Level:
         """A level below a finer one. Where steps regained too little of what merging cost, it is made again, merged as the recipe allows."""
         level = self._made(name, band, arguments)
-        lost = _better(self.yardstick, finer, level, band.scale)
-        if arguments.get("merging_costs") != MERGING_COSTS or lost <= MOST_LOST:
+        merged_further = "start" in arguments and "merging_costs" not in self.request.settings
+        if not merged_further or _better(self.yardstick, finer, level, band.scale) <= MOST_LOST:
             return level
         return self._made(f"{name}_merged_less", band, {**arguments, "merging_costs": recipe(self.request.recipe, band.scale).merging_costs})
 
