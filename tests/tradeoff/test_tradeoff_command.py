@@ -70,3 +70,10 @@ def test_a_page_that_cannot_be_written_is_written_by_the_same_command(tmp_path, 
 def test_a_page_goes_with_the_results_that_it_shows(tmp_path):
     assert command(tmp_path, "--report") == 0 and (tmp_path / "new" / "report.html").exists()
     assert command(tmp_path, "--overwrite") == 0 and not (tmp_path / "new" / "report.html").exists()
+
+
+def test_a_page_of_something_else_stays(tmp_path):
+    ladder = tmp_path / "new"
+    ladder.mkdir()
+    (ladder / "report.html").write_text("<title>mipmap_plugin</title>")
+    assert command(tmp_path) == 0 and (ladder / "report.html").exists()

@@ -87,7 +87,8 @@ def write(folder: Folder, tradeoffs: Sequence[Tradeoff], *, complete: bool) -> N
 
     Raises OutputExists, OutputError, and SettingsError without matplotlib.
     """
-    spent = [*page_at(folder.path / PAGE), *([folder.path / KEPT] if complete else [])]
+    page = page_at(folder.path / PAGE) if (folder.path / NAMES[0]).exists() else []  # else it shows something else, such as a ladder
+    spent = [*page, *([folder.path / KEPT] if complete else [])]
     with together(folder.path / NAMES[0], spent):
         write_json(folder.path / NAMES[0], facts(tradeoffs, complete), folder.overwrite)
         _write_table(folder, tradeoffs)
