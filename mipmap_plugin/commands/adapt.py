@@ -158,14 +158,20 @@ def _made(base: Wrapped, files: Sequence[File], settings: dict[str, Any], page: 
     base.keeps_images, reports = len(files) > 1, list[Facts]()
     for scale, viewer, target in files:
         adapted = base.adapt(scale, viewer=viewer, resume=state_path(target), **settings)
-        with together(target) if page and page.of_one else nullcontext():  # a file never appears without a page of its own
+        failed: BaseException | None = None
+        with together(target) if page and page.of_one else nullcontext():  # a kill leaves both or none
             saved = adapted.save(target, overwrite=overwrite)
             report = adapted.report_of(saved)
             reports.append({"file": str(saved.absolute()), **report.model_dump()})
-            if page:
-                page.add(base, adapted.as_written(saved))
-            if page and page.of_one:
-                page.write(reports, ())
+            try:
+                if page:
+                    page.add(base, adapted.as_written(saved))
+                if page and page.of_one:
+                    page.write(reports, ())
+            except BaseException as error:  # Ctrl-C too: the file is worth more than its page
+                failed = error
+        if failed:
+            raise failed
         if not quiet:
             _say(saved, report, adapted.model)
             show_before_and_after(base, adapted)

@@ -165,14 +165,12 @@ def test_a_page_goes_with_the_file_that_it_shows(run, model_folder, tmp_path):
     assert (tmp_path / "a.ply").exists() and not (tmp_path / "a.ply.report.html").exists()
 
 
-def test_a_file_whose_page_cannot_be_written_does_not_appear_without_it(run, model_folder, tmp_path, monkeypatch):
-    def full(*_):
-        raise OutputError("the disk is full")
+@pytest.mark.parametrize("error", [OutputError("the disk is full"), KeyboardInterrupt()])
+def test_a_file_is_kept_whose_page_fails(run, model_folder, tmp_path, monkeypatch, error):
+    def fail(*_):
+        raise error
 
-    words = ["adapt", model_folder, "--scale", "1/2", "--output", tmp_path / "a.ply", "--recipe", "instant", "--report"]
-    with monkeypatch.context() as failing:
-        failing.setattr("mipmap_plugin.pages.html.write_page", full)
-        assert "the disk is full" in refused(run(*words))
-    assert not (tmp_path / "a.ply").exists()
-    run(*words)
-    assert (tmp_path / "a.ply").exists() and (tmp_path / "a.ply.report.html").exists()
+    monkeypatch.setattr("mipmap_plugin.pages.html.write_page", fail)
+    code, _, told = run("adapt", model_folder, "--scale", "1/2", "--output", tmp_path / "a.ply", "--recipe", "instant", "--report")
+    assert code == (130 if isinstance(error, KeyboardInterrupt) else 2) and (str(error) or "interrupted") in told
+    assert (tmp_path / "a.ply").exists() and not (tmp_path / "a.ply.report.html").exists()
