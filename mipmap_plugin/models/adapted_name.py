@@ -15,9 +15,9 @@ from mipmap_plugin.models.zipped_folder import opened
 GLTF = (".glb", ".gltf")
 COMPRESSED = EXCHANGE["compressed"][1]
 
-# Families that are saved with torch, and the viewers that read what they save; any other needs a PLY.
+# Families that are saved with torch, and the viewers of the same projects; for any other a PLY is written.
 SAVED_WITH_TORCH = ("gsplat", "splatfacto")
-READ_THESE = ("gsplat", "gsplat-antialiased", "nerfstudio", "nerfstudio-antialiased")
+OWN_VIEWERS = ("gsplat", "gsplat-antialiased", "nerfstudio", "nerfstudio-antialiased")
 
 
 def adapted_name(checkpoint: Path, scale: float, viewer: str | None = None) -> str:
@@ -63,8 +63,8 @@ def _endings(checkpoint: Path, name: str, viewer: str | None) -> tuple[str, str]
 
 
 def _of_folder(checkpoint: Path, viewer: str | None) -> str:
-    """The ending of what a checkpoint is saved as that otherwise becomes a folder: ".ply" for a viewer that reads no other file, or ""."""
-    if viewer is None or viewer in READ_THESE:
+    """The ending of what a checkpoint is saved as that otherwise becomes a folder: ".ply" where another project's viewer shows it, or ""."""
+    if viewer is None or viewer in OWN_VIEWERS:
         return ""
     try:
         return ".ply" if detect(checkpoint).family in SAVED_WITH_TORCH else ""
