@@ -1,7 +1,7 @@
 """gsplat (1.5 and later) as a backend: the user's own installation, called so that it renders the reference's image.
 
 The arguments, and the differences from the reference below, were verified with gsplat 1.5.3 on a GPU, and are with its torch implementations
-in place of its CUDA kernels (`tests/test_gsplat_backend.py`):
+in place of its CUDA kernels (`tests/backends/test_gsplat_backend.py`):
 
 - the largest alpha is 0.999 in 1.5 and 0.99, as in the reference, in 1.6: an opaque splat's center is up to 0.009 brighter;
 - the compensation of "antialiased" has no lower bound in 1.5, and the reference's, 0.005, in 1.6. "mip", whose lower bound is

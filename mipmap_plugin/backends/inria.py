@@ -1,6 +1,7 @@
 """INRIA's `diff_gaussian_rasterization` as a backend, in both generations, if the user has built it. No code of it is included.
 
-The arguments were verified with a stand-in that renders what they say (`tests/test_inria_backend.py`), and on a GPU with the older generation.
+The arguments were verified with a stand-in that renders what they say (`tests/backends/test_inria_backend.py`), and on a GPU
+with the older generation.
 The rasterizer's conventions are fixed; requests are adapted to them:
 
 - its near plane is 0.2: the scene is scaled so that the requested near plane lies there. The eye becomes the origin, so no digits are lost;

@@ -1,7 +1,7 @@
 """The Triton backend: a CUDA rasterizer without a build step, for Triton comes with torch's CUDA wheels. Same image as the reference.
 
 The kernels are also compiled for compute capability 7.5, 8.0 and 9.0, and run on tiny images in Triton's interpreter on a CPU, in
-`tests/test_triton_backend.py` and `tests/test_triton_interpreted*.py`. The first run on a machine compiles them, and so does the
+`tests/backends/test_triton_backend.py` and `tests/backends/test_triton_interpreted*.py`. The first run on a machine compiles them, and so does the
 first for a viewer, whose settings are not the usual ones; what an adaptation needs is compiled side by side, on all of torch's threads, in 10 s.
 
 A view whose lists of splats take too much memory is drawn in strips (`triton_kernels/lists.py`).

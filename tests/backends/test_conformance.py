@@ -277,7 +277,7 @@ def test_builders_give_the_same_case_each_time():
 
 def test_the_example_runs_where_pytest_is_missing():
     """On its first cases."""
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     few = "from mipmap_plugin.backends.conformance import CASES; [CASES.popitem() for _ in range(len(CASES) - 20)]"
     run = f"import runpy, sys; sys.modules['pytest'] = None; {few}; runpy.run_path('examples/register_backend.py', run_name='__main__')"
     environment = {**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}

@@ -58,7 +58,7 @@ def test_a_wrong_name_is_found():
 
 NOT_RUN = {
     "view": "serves a page until Ctrl-C; tests/browser/test_live_view.py",
-    "demo": "run by .ci/run and tests/test_demo.py",
+    "demo": "run by .ci/run and tests/demo/test_demo.py",
     "--full": "several minutes; tests/hard has it",
     "NAME": "stands for a name",
     "phone.spz": "splat-transform may not be installed",

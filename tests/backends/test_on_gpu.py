@@ -13,12 +13,12 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import pytest
-import test_surfels
+import surfel_checkpoints
 import tiny
 import torch
 from torch import Tensor
 
-sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))  # its modules import one another by bare names, as scripts do
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))  # its modules import one another by bare names, as scripts do
 
 from family_scenes import FAMILIES, views
 
@@ -67,7 +67,7 @@ def shown(wrapped: Wrapped, cameras, scales=(1 / 2, 1.0, 2.0), **settings) -> Sh
 
 
 def base_of(family: str, folder: Path):
-    (test_surfels.folder if family == "2dgs" else FAMILIES[family].write)(folder)
+    (surfel_checkpoints.folder if family == "2dgs" else FAMILIES[family].write)(folder)
     return load_model(folder), [view.resized(32, 24) for view in views(4, "train", family in FAMILIES and FAMILIES[family].moves)]
 
 

@@ -24,7 +24,7 @@ from mipmap_plugin.scenes import write_cameras
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
-EXAMPLE, FILES = (runpy.run_path(str(Path(__file__).parents[1] / "examples" / name)) for name in ("register_family.py", "register_family_files.py"))
+EXAMPLE, FILES = (runpy.run_path(str(Path(__file__).parents[2] / "examples" / name)) for name in ("register_family.py", "register_family_files.py"))
 
 
 def archive(path):

@@ -1,20 +1,16 @@
 """The dolly benchmark's own parts: exact zooms, whole frames, flicker that only what is wrong makes, and a page from measured films."""
 
-import sys
 from pathlib import Path
 
 import pytest
 import tiny
 import torch
-from PIL import Image
-
-sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))  # its modules import one another by bare names, as scripts do
-
 from levels import Dolly, Show, at, changes, film, middle
 from levels_counts import Row
 from levels_counts import page as page_of_counts
 from levels_page import HEIGHT, WORDS, draw, page, strip
 from levels_photographs import against, photograph
+from PIL import Image
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.evaluation.protocols import PROTOCOLS

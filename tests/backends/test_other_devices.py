@@ -10,7 +10,7 @@ import mip_checkpoints
 import moving
 import pretended
 import pytest
-import test_surfels
+import surfel_checkpoints
 import tiny
 import torch
 import torch_checkpoints
@@ -62,7 +62,7 @@ def plain_adam(monkeypatch):
 
 FAMILIES = {
     "3dgs": lambda path: tiny.folder(path, tiny.cameras()),
-    "2dgs": test_surfels.folder,
+    "2dgs": surfel_checkpoints.folder,
     "mip": lambda path: mip_checkpoints.folder(path, "mip"),
     "scaffold": lambda path: anchor_checkpoints.write(path),
     "octree": lambda path: anchor_checkpoints.write(path, anchor_checkpoints.Layout("octree", level=True)),

@@ -8,7 +8,7 @@ import gltf_files
 import mip_checkpoints
 import moving
 import pytest
-import test_surfels
+import surfel_checkpoints
 import tiny
 import torch_checkpoints
 from test_contract import Ellipsoids, Theirs, save_as_text, wrapped
@@ -22,7 +22,7 @@ from mipmap_plugin.models.vanilla import VanillaModel
 
 WRITERS = {
     "3dgs": partial(tiny.folder, views=tiny.cameras()),
-    "2dgs": test_surfels.folder,
+    "2dgs": surfel_checkpoints.folder,
     **{family: partial(mip_checkpoints.folder, family=family) for family in ("mip", "gof", "analytic")},
     "scaffold": anchor_checkpoints.write,
     "octree": partial(anchor_checkpoints.write, layout=anchor_checkpoints.Layout("octree", level=True)),
@@ -33,7 +33,7 @@ WRITERS = {
     "splatfacto": lambda path: torch_checkpoints.splatfacto_folder(path, torch_checkpoints.splats()),
 }
 
-# The first needs splat-transform, which is no Python package; tests/exchange tests it with a stand-in. The second is in tests/test_zipped.py.
+# The first needs splat-transform, which is no Python package; tests/exchange tests it with a stand-in. The second is in tests/formats/test_zipped.py.
 ELSEWHERE = {"exchange", "zipped"}
 
 

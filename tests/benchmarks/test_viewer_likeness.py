@@ -1,17 +1,13 @@
 """The table of how like a viewer's picture ours is: what was not measured again is kept."""
 
 import json
-import sys
-from pathlib import Path
 
 import pytest
 
 pytest.importorskip("playwright", reason="browsers are driven with playwright")
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-sys.path.append(str(BENCHMARKS))  # its modules import one another by bare names, as scripts do
 
-import viewer_likeness  # noqa: E402
+import viewer_likeness
 
 
 class NoBrowser:

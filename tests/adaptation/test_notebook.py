@@ -18,7 +18,7 @@ from mipmap_plugin.models.adapted_scale import adapted_scale
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
-NOTEBOOK = Path(__file__).parents[1] / "examples" / "notebook.ipynb"
+NOTEBOOK = Path(__file__).parents[2] / "examples" / "notebook.ipynb"
 
 
 @pytest.fixture(scope="module")

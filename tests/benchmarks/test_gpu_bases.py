@@ -7,13 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import gpu_bases
 import pytest
 import tiny
 import torch
-
-sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))  # its modules import one another by bare names, as scripts do
-
-import gpu_bases
 
 from mipmap_plugin import Camera, Effects, Gaussians, load_scene, wrap_model
 from mipmap_plugin.backends import get_backend

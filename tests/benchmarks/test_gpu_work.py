@@ -4,24 +4,18 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import sys
 import time
-from pathlib import Path
 
+import gpu
+import gpu_adaptation
+import gpu_conformance
+import gpu_views
 import pytest
 import tiny
-
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-sys.path.append(str(BENCHMARKS))  # its modules import one another by bare names, as scripts do
-
-import gpu  # noqa: E402
-import gpu_adaptation  # noqa: E402
-import gpu_conformance  # noqa: E402
-import gpu_views  # noqa: E402
-from gpu_adaptation import Base  # noqa: E402
-from gpu_records import Failure  # noqa: E402
-from gpu_results import Results  # noqa: E402
-from gpu_work import DONE, Work, carry_out, forget, kept  # noqa: E402
+from gpu_adaptation import Base
+from gpu_records import Failure
+from gpu_results import Results
+from gpu_work import DONE, Work, carry_out, forget, kept
 
 WHOLE = {"part": 1.0, "other": 1.0}
 

@@ -1,13 +1,8 @@
 """The scenes that the families' table is measured on are what its caption says."""
 
-import sys
-from pathlib import Path
 
 import pytest
 import torch
-
-sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))  # its modules import one another by bare names, as scripts do
-
 from families import Change, Quality, Row, main, table
 from family_scenes import FAMILIES, Pictures, views
 

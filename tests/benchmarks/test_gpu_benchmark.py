@@ -9,37 +9,35 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
+import gpu
+import gpu_adaptation
+import gpu_conformance
+import gpu_first_use
+import gpu_profile
+import gpu_speed
 import pretended
 import pytest
 import tiny
 import torch
+from gpu_adaptation import Base, Place
+from gpu_conformance import check
+from gpu_gsplat import Itself
+from gpu_profile import kernels, of_trace
+from gpu_records import Adaptation, Checked, Failure, Kernel, Profile, Speed, Views
+from gpu_results import Results, report
+from gpu_speed import Scene, denser
+from gpu_tables import speed_table
+from gpu_timing import Clock, copied_per_second
+from gpu_views import Shots, measure
 from gsplat_stand_in import StandIn
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-sys.path.append(str(BENCHMARKS))  # its modules import one another by bare names, as scripts do
+from mipmap_plugin import load_model
+from mipmap_plugin.backends.conformance import Outcome
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.backends.triton import interpreted
+from mipmap_plugin.effects import Effects
 
-import gpu  # noqa: E402
-import gpu_adaptation  # noqa: E402
-import gpu_conformance  # noqa: E402
-import gpu_first_use  # noqa: E402
-import gpu_profile  # noqa: E402
-import gpu_speed  # noqa: E402
-from gpu_adaptation import Base, Place  # noqa: E402
-from gpu_conformance import check  # noqa: E402
-from gpu_gsplat import Itself  # noqa: E402
-from gpu_profile import kernels, of_trace  # noqa: E402
-from gpu_records import Adaptation, Checked, Failure, Kernel, Profile, Speed, Views  # noqa: E402
-from gpu_results import Results, report  # noqa: E402
-from gpu_speed import Scene, denser  # noqa: E402
-from gpu_tables import speed_table  # noqa: E402
-from gpu_timing import Clock, copied_per_second  # noqa: E402
-from gpu_views import Shots, measure  # noqa: E402
-
-from mipmap_plugin import load_model  # noqa: E402
-from mipmap_plugin.backends.conformance import Outcome  # noqa: E402
-from mipmap_plugin.backends.reference import ReferenceBackend  # noqa: E402
-from mipmap_plugin.backends.triton import interpreted  # noqa: E402
-from mipmap_plugin.effects import Effects  # noqa: E402
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 OURS = Speed("triton", "classic", 1_000_000, 1920, 1080, 1.0, 4.0, 100.0, 10**9, 2 * 10**9)
 THEIRS = Speed("gsplat itself", "classic", 1_000_000, 1920, 1080, 2.0, 5.0, 200.0, 10**9, 2 * 10**9)

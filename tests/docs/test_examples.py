@@ -17,7 +17,7 @@ from mipmap_plugin.wrap import Wrapped
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 SCRIPTS = ["adapt_checkpoint.py", *sorted(file.name for file in EXAMPLES.glob("register_*.py") if file.name != "register_backend.py")]
 POINTS = [
     EntryPoint("careful", "register_backend:CarefulBackend", "mipmap_plugin.backends"),

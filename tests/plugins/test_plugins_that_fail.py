@@ -304,6 +304,6 @@ def test_a_package_whose_entry_points_cannot_be_read_is_named(tmp_path, text, co
     folder.mkdir()
     (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1.0\n")
     (folder / "entry_points.txt").write_bytes(text)
-    paths = os.pathsep.join([*filter(None, [os.environ.get("PYTHONPATH")]), str(Path(__file__).parents[1]), str(tmp_path)])
+    paths = os.pathsep.join([*filter(None, [os.environ.get("PYTHONPATH")]), str(Path(__file__).parents[2]), str(tmp_path)])
     ended = subprocess.run([sys.executable, "-c", code, "list"], env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True)
     assert "the entry points of the installed package stranger 1.0 cannot be read" in ended.stderr.splitlines()[-1], ended.stderr

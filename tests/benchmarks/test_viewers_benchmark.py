@@ -1,13 +1,8 @@
 """The table of what real viewers show: what was measured before stays, and what was not measured is not made up."""
 
 import json
-import sys
-from pathlib import Path
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-sys.path.append(str(BENCHMARKS))  # its modules import one another by bare names, as scripts do
-
-from viewers import Row, count_of, keep, page  # noqa: E402
+from viewers import Row, count_of, keep, page
 
 
 def test_what_is_not_measured_again_is_kept(tmp_path):

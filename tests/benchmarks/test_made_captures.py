@@ -1,13 +1,8 @@
 """Made-up captures: what adapting does where cameras are as people move them, and the table of it."""
 
 import json
-import sys
-from pathlib import Path
 
 import pytest
-
-sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))  # its modules import one another by bare names, as scripts do
-
 from captures import Row, main
 from made_captures import CAPTURES
 from rows import joined

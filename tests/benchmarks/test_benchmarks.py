@@ -2,39 +2,36 @@
 
 import importlib.util
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import real_bases
 import tiny
 import torch
+import unbounded
+from ablations import ABLATIONS
+from backends import facts, joined
+from measure import Scaling, Speed, Spread, Timing
+from rows import write_page
+from scenes import make
+from tables import Row, Rows
+from workloads import Size, Variant, activated, count_pairs, effects_of, from_scene, from_variant, split_into
+from zoom_in import kept as kept_with_networks
+from zoom_in_plot import draw
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-sys.path.append(str(BENCHMARKS))  # its modules import one another by bare names, as scripts do
+from mipmap_plugin.backends import get_backend
+from mipmap_plugin.evaluation.evaluate import Row as Judged
+from mipmap_plugin.evaluation.measure import views_seen
+from mipmap_plugin.evaluation.report import records
+from mipmap_plugin.formats.atomic import write_json
+from mipmap_plugin.recipes import recipe as make_config
+from mipmap_plugin.splatting.projection import project
+from mipmap_plugin.splatting.rotations import rotations
+from mipmap_plugin.wrap import wrap_model
 
-import real_bases  # noqa: E402
-import unbounded  # noqa: E402
-from ablations import ABLATIONS  # noqa: E402
-from backends import facts, joined  # noqa: E402
-from measure import Scaling, Speed, Spread, Timing  # noqa: E402
-from rows import write_page  # noqa: E402
-from scenes import make  # noqa: E402
-from tables import Row, Rows  # noqa: E402
-from workloads import Size, Variant, activated, count_pairs, effects_of, from_scene, from_variant, split_into  # noqa: E402
-from zoom_in import kept as kept_with_networks  # noqa: E402
-from zoom_in_plot import draw  # noqa: E402
-
-from mipmap_plugin.backends import get_backend  # noqa: E402
-from mipmap_plugin.evaluation.evaluate import Row as Judged  # noqa: E402
-from mipmap_plugin.evaluation.measure import views_seen  # noqa: E402
-from mipmap_plugin.evaluation.report import records  # noqa: E402
-from mipmap_plugin.formats.atomic import write_json  # noqa: E402
-from mipmap_plugin.recipes import recipe as make_config  # noqa: E402
-from mipmap_plugin.splatting.projection import project  # noqa: E402
-from mipmap_plugin.splatting.rotations import rotations  # noqa: E402
-from mipmap_plugin.wrap import wrap_model  # noqa: E402
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 
 def brute_force_pairs(gaussians, camera):

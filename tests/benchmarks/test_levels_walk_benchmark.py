@@ -1,15 +1,10 @@
 """The walk's own parts: what a film measures, and its page."""
 
-import sys
 from dataclasses import asdict
-from pathlib import Path
 
 import pytest
 import tiny
 import torch
-
-sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))  # its modules import one another by bare names, as scripts do
-
 from levels_walk import film, page, scales, walks
 
 from mipmap_plugin import wrap_model

@@ -6,12 +6,12 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import ply_files
 import pytest
 import tiny
 import torch
 from oracle import color_one
 from samples import camera, gaussians, leaves
+from surfel_checkpoints import columns, folder
 
 from mipmap_plugin.adaptation.start.surfel_form import visible_area
 from mipmap_plugin.backends import choose_backend, survey
@@ -23,12 +23,10 @@ from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import detect, load_model
-from mipmap_plugin.models.columns import to_columns
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.models.surfels import FLAT, SurfelModel, flat_trained, flattened
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.render_settings import RenderSettings
-from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.splatting.projection import Projected
 from mipmap_plugin.splatting.rotations import rotations
 from mipmap_plugin.wrap import wrap_model
@@ -171,20 +169,6 @@ def test_the_area_is_that_of_the_larger_of_both(axes):
     entries = (spread[i, j].reshape(1) for i, j in ((0, 0), (0, 1), (1, 1)))
     shown = Projected(torch.zeros(1, 2), torch.ones(1), *entries, torch.tensor([a * a * b * b]))
     assert float(2 * math.pi * visible_area(shown, 0.5)) == pytest.approx(float(torch.exp(-squared / 2).sum()) * cell, rel=1e-3)
-
-
-def columns(count=50):
-    """Raw columns as 2DGS writes them: those of 3DGS without scale_2."""
-    return {name: column for name, column in to_columns(tiny.model(count).parameters()).items() if name != "scale_2"}
-
-
-def folder(path):
-    ply = path / "point_cloud" / "iteration_30000" / "point_cloud.ply"
-    ply.parent.mkdir(parents=True)
-    ply_files.write(ply, columns())
-    (path / "cfg_args").write_text("Namespace(sh_degree=1, resolution=1, white_background=False, eval=False, render_items=['RGB', 'Alpha'])")
-    write_cameras(path / "cameras.json", tiny.cameras())
-    return path
 
 
 def test_a_checkpoint_is_read_as_it_is(tmp_path):
