@@ -58,7 +58,7 @@ def run(words: str, folder: str) -> str:
 def page(name: str, said: str) -> str:
     lines = said.rstrip().splitlines()
     end = max(number for number, line in enumerate(lines) if line.startswith("|"))
-    sentences = "\n".join(f"- {line}" for line in lines[end + 1 :])
+    sentences = "\n".join(f"- {line}" for line in lines[end + 1 :] if not line.startswith("written: "))  # to a folder that is gone
     return f"""# What accuracy costs in time: lego at {name}
 
 Made by
