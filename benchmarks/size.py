@@ -47,10 +47,9 @@ INTRO = """# Scenes of real size
 
 Made by `python benchmarks/size.py DATA`, in pieces: seconds, CPU seconds and the peak of memory (over what Python, torch and the package
 themselves take, as a multiple of the PLY's size) of whole commands and of their phases, `adapt` at x1/4, on flowers with its splats split into so
-many, 173 cameras of 1256 x 828 px. *Silence*: the longest time without a sign on the terminal, and in brackets until the first. Five others used the
-two cores, so that seconds and silences are several times those of a quiet machine: compare CPU seconds. *before*: 6867b30.
-*f209cd6*, *89d0881* and *70a6b79*: later ones, from before `adapt` took less memory. *views at once* and *by rows*: whole runs on two free cores,
-of c5985b9 with 600 steps, and of 1b73abd with as many as its `default` takes: 475 at 300,000 splats, 150 at 1 and 3 million.
+many, 173 cameras of 1256 x 828 px. *Silence*: the longest time without a sign on the terminal, and in brackets until the first. *by rows*: runs
+of 1b73abd on two free cores, with as many steps as its `default` takes: 475 at 300,000 splats, 150 at 1 and 3 million. In the other rows five others
+used the two cores, so that seconds and silences are several times those of a quiet machine: compare CPU seconds. *before*: 6867b30.
 `evaluate`: the base and everything that needs no adapting, on {photographs} photographs. {machine}
 """
 HEAD = "| splats | command | version | phase | seconds | CPU s | peak / file | silence |\n|" + "---|" * 8
