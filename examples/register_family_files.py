@@ -2,8 +2,8 @@
 
     python examples/register_family_files.py scene.npz --scale 1/4
 
-Its parameters, in memory, are those of 3DGS: so its splats can be merged, optimized and written as a PLY for viewers. A family that cannot be
-told so is a class with the methods of `mipmap_plugin.models.SplatModel`.
+Its parameters, in memory, are those of 3DGS: so its splats can be merged, optimized and written as a PLY for viewers. One whose splats are
+something else is a class with the methods of `mipmap_plugin.models.SplatModel`.
 """
 
 from __future__ import annotations
