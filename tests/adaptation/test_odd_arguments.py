@@ -1,6 +1,7 @@
 """Records and methods of the API given tensors, arrays and numbers of the wrong kind: one error of ours, in place of torch's or Python's."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -57,6 +58,24 @@ def test_what_is_no_number_of_a_camera_is_named(name, value):
 def test_splats_of_other_kinds_of_tensors_are_named(change, sentence):
     with pytest.raises(ShapeError, match=sentence):
         Gaussians(**{name: change(tensor) for name, tensor in tiny.gaussians(3).tensors().items()})
+
+
+@pytest.mark.parametrize(("call", "error", "sentence"), [
+    (lambda splats: splats.to("nowhere"), SettingsError, "splats cannot be moved .device='nowhere', dtype=None.: Expected one of cpu"),
+    (lambda splats: splats.to(torch.float64), SettingsError, "splats cannot be moved .device=torch.float64"),
+    (lambda splats: splats.to(dtype=torch.int32), ShapeError, "means: expected floating-point numbers"),
+    (lambda splats: splats[0], ShapeError, "splats are chosen by a mask, a list of indices or a slice, got an int"),
+    (lambda splats: splats["means"], ShapeError, "got a str"),
+    (lambda splats: splats[torch.tensor([[0, 1]])], ShapeError, "got a Tensor"),
+    (lambda splats: splats.joined(3), ShapeError, r"only splats of one kind can be joined \(SH degree 1, float32 on cpu\), got 3"),
+    (lambda splats: splats.joined(splats.to(dtype=torch.float64)), ShapeError, "float64 on cpu"),
+    (lambda splats: splats.joined(splats.to("meta")), ShapeError, "float32 on meta"),
+    (lambda splats: splats.joined(replace(splats, sh=splats.sh[:, :1])), ShapeError, "SH degree 0"),
+    (lambda splats: splats.joined(replace(splats, covariances=torch.eye(3).expand(3, 3, 3))), ShapeError, "with covariances"),
+])  # fmt: skip
+def test_what_cannot_be_done_with_splats_is_one_sentence(call, error, sentence):
+    with pytest.raises(error, match=sentence):
+        call(tiny.gaussians(3))
 
 
 @pytest.mark.parametrize(("call", "sentence"), [
