@@ -202,6 +202,17 @@ def test_of_two_packages_with_one_name_the_first_is_used_and_the_other_is_told(m
     assert BACKENDS.packages() == {"ours": [f"{__name__}:Fast", f"{__name__}:Fussy"]}
 
 
+def test_a_package_without_metadata_is_named_by_its_folder(tmp_path, monkeypatch):
+    """As a broken installation leaves one."""
+    folder = tmp_path / "stranger-1.0.dist-info"
+    folder.mkdir()
+    (folder / "entry_points.txt").write_text("[mipmap_plugin.backends]\nmine = stranger:Backend\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert BACKENDS.packages()["mine"] == [f"stranger:Backend of {folder}"]
+    (folder / "entry_points.txt").write_text("[any]\nmine\n")
+    assert f"the installed package {folder} cannot be read" in registry.unreadable_package()
+
+
 def test_what_is_wrong_with_the_first_of_two_packages_with_one_name_is_told_of_it(monkeypatch):
     points = [EntryPoint("ours", f"{__name__}:{kind}", "mipmap_plugin.backends") for kind in ("Crashing", "Fussy")]
     monkeypatch.setattr(registry, "entry_points", lambda group: points)
