@@ -35,6 +35,15 @@ def test_evaluate_prints_a_table_and_writes_its_rows(run, model_folder, tmp_path
     refused(run(*words), "rows.json exists already; pass --overwrite")
 
 
+def test_a_page_does_not_outlive_its_rows(run, model_folder, tmp_path):
+    words = ["evaluate", model_folder, "--images", tiny.scene(tmp_path / "scene"), "--output", tmp_path / "rows.json", "--scale", "1"]
+    assert run(*words)[0] == 0 and (tmp_path / "rows.html").exists()
+    assert run(*words, "--overwrite")[0] == 0 and (tmp_path / "rows.html").exists()
+    assert run(*words, "--overwrite", "--no-report")[0] == 0 and not (tmp_path / "rows.html").exists()
+    (tmp_path / "rows.html").write_text("<title>mine</title>")
+    assert run(*words, "--overwrite", "--no-report")[0] == 0 and (tmp_path / "rows.html").exists()
+
+
 def test_evaluate_says_where_a_file_is_adapted_to_images_of_another_filter_than_the_truths(run, model_folder, tmp_path):
     scene = tiny.scene(tmp_path / "scene")
     words = ["evaluate", model_folder, "--images", scene, "--scale", "1/2", "--recipe", "default", "--recipe", "instant", "--steps", "1"]
