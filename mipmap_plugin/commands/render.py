@@ -91,16 +91,16 @@ def render(
     _check(wrapped, views, exposure)
     with _kept(record, finished):
         for camera, picture in counted(left, len(left), "rendering", "view"):
-            rendered = wrapped.render(camera.zoomed(zoom), zoom, filter_name, supersampling, **options)
-            with together(record):
-                _write(picture, rendered, outputs, overwrite)
-                write_json(record, {"finished": [*finished, picture.name]}, overwrite=True)
-            finished.append(picture.name)
-    count = plural(len(views), "picture")
-    say(f"{count} in {output}{_told_by_file(zoom if scale is None else 1.0, own_viewer)}")
+            _write(picture, wrapped.render(camera.zoomed(zoom), zoom, filter_name, supersampling, **options), outputs, overwrite, record, finished)
+    say(f"{plural(len(views), 'picture')} in {output}{_told_by_file(zoom if scale is None else 1.0, own_viewer)}")
+    _tell_of_cameras(wrapped, cameras)
+
+
+def _tell_of_cameras(wrapped: Wrapped, given: Path | None) -> None:
+    """Say where the views come from, unless it is the scene itself."""
     if not wrapped.cameras:
         say(f"seen from a generated orbit, {wrapped.viewpoints.orbit.told()}; --cameras gives the scene's own cameras")
-    if place := base_cameras(wrapped, cameras):
+    if place := base_cameras(wrapped, given):
         say(f"seen by the cameras of its base, in {place}; --cameras gives others")
 
 
@@ -209,12 +209,16 @@ def _refuse(wrapped: Wrapped, pictures: Sequence[Path], outputs: Sequence[str], 
         refuse_unwritable(picture)
 
 
-def _write(picture: Path, rendered: Rendered, outputs: Sequence[str], overwrite: bool) -> None:
+def _write(picture: Path, rendered: Rendered, outputs: Sequence[str], overwrite: bool, record: Path, finished: list[str]) -> None:
+    """Write a picture and its other outputs, and that it is finished: all of it or nothing."""
     from mipmap_plugin.formats.images import write_array, write_image
 
-    write_image(picture, rendered.image, overwrite=overwrite)
-    for name in outputs:
-        write_array(_beside(picture, name), getattr(rendered, name), overwrite=overwrite)
+    with together(record):
+        write_image(picture, rendered.image, overwrite=overwrite)
+        for name in outputs:
+            write_array(_beside(picture, name), getattr(rendered, name), overwrite=overwrite)
+        write_json(record, {"finished": [*finished, picture.name]}, overwrite=True)
+    finished.append(picture.name)
 
 
 def _beside(picture: Path, name: str) -> Path:

@@ -15,7 +15,7 @@ from mipmap_plugin.commands.resuming import resumable
 from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.evaluation.measure import baselines
 from mipmap_plugin.evaluation.tradeoff import measuring
-from mipmap_plugin.evaluation.tradeoff.files import KEPT, Folder, facts, table
+from mipmap_plugin.evaluation.tradeoff.files import KEPT, Folder, facts, table, write
 from mipmap_plugin.evaluation.tradeoff.front import Tradeoff
 from mipmap_plugin.evaluation.tradeoff.measuring import OBSERVED_STEPS, RENDERERS, measure
 from mipmap_plugin.evaluation.tradeoff.points import Plan
@@ -257,6 +257,14 @@ def test_json_csv_and_table_hold_every_point(tmp_path):
     text = table(found[0])
     assert found[0].truth in text and all(sentence in text for sentence in found[0].sentences())
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["tradeoff.csv", "tradeoff.json"]
+
+
+def test_a_plot_does_not_outlive_its_results(tmp_path):
+    (tmp_path / "tradeoff.png").write_bytes(b"of an earlier command")
+    write(Folder(tmp_path, picture=False, overwrite=True), [], complete=True)
+    assert (tmp_path / "tradeoff.png").exists()  # there are no results that it is of
+    write(Folder(tmp_path, picture=False, overwrite=True), [], complete=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["tradeoff.csv", "tradeoff.json"]
 
 
 def test_ctrl_c_keeps_what_was_measured_and_says_where(tmp_path, monkeypatch, capsys):
