@@ -89,13 +89,6 @@ def test_gradients_equal_finite_differences():
         assert torch.autograd.gradcheck(lambda *t, e=effects: BACKEND.render(Gaussians(*t), view, e).image, tensors, atol=1e-6, fast_mode=True)
 
 
-def test_every_parameter_has_a_gradient():
-    tensors, g = leaves(gaussians())
-    BACKEND.render(g, camera(), Effects(1)).image.square().sum().backward()
-    for tensor in tensors:
-        assert torch.isfinite(tensor.grad).all() and tensor.grad.abs().sum() > 0
-
-
 def test_t1_spherical_harmonics():
     expected = [0.282094792, -0.261169028, 0.391753542, -0.130584514, 0.156078347, -0.468235042, 0.292863596, -0.234117521,
                 -0.117058760, 0.022527969, 0.331092173, -0.540952781, 0.064115724, -0.270476391, -0.248319130, 0.123903829]  # fmt: skip
