@@ -218,6 +218,16 @@ def test_changed_parameters_are_activated_anew_to_the_same_bytes():
     assert of(model, again) not in (None, again)
 
 
+def test_moments_that_an_optimizer_has_forgotten_start_anew():
+    model = student()
+    rows, optimizer = of(model), optimizer_of(model)
+    for _ in range(2):
+        optimizer.state.clear()
+        differentiate(rows)
+        rows.step(optimizer)
+    assert {float(optimizer.state_of(tensor)["step"]) for tensor in model.parameters().values()} == {1.0}
+
+
 def test_only_plain_splats_that_all_move_go_by_rows():
     model, surfels = student(), SurfelModel(tiny.model().parameters()).copy()
     assert of(model) is not None and of(surfels) is None and ByRows.of(model, None, None) is None
