@@ -10,7 +10,6 @@ import torch
 
 from mipmap_plugin import Camera, Effects, Gaussians, load_model, wrap_model
 from mipmap_plugin.errors import SettingsError, ShapeError
-from mipmap_plugin.render_settings import RenderSettings
 
 VIEW = {"width": 8, "height": 6, "fx": 5.0, "fy": 5.0, "cx": 4.0, "cy": 3.0, "viewmat": torch.eye(4)}
 
@@ -18,17 +17,12 @@ VIEW = {"width": 8, "height": 6, "fx": 5.0, "fy": 5.0, "cx": 4.0, "cy": 3.0, "vi
 @pytest.mark.parametrize(("name", "value"), [
     ("sh_degree", "x"), ("sh_degree", 1.5), ("sh_degree", -1), ("screen_filter", 3), ("eps2d", "0.3"), ("eps2d", math.nan), ("eps2d", torch.ones(2)),
     ("background", 1), ("background", (0, 0, math.nan)), ("background", "abc"), ("supersampling", 2.0), ("supersampling", None),
-    ("near_plane", "x"), ("settings", None), ("outputs", 3), ("outputs", "depth"), ("exposure", []),
+    ("near_plane", "x"), ("near_plane", -1.0), ("near_plane", math.nan), ("near_plane", math.inf),
+    ("settings", None), ("outputs", 3), ("outputs", "depth"), ("exposure", []),
 ])  # fmt: skip
 def test_effects_of_the_wrong_kind_are_named(name, value):
     with pytest.raises(SettingsError, match=name):
         Effects(**{name: value})
-
-
-@pytest.mark.parametrize("name", ["radial", "bucketed", "fades", "fits_picture"])
-def test_switches_of_render_settings_are_true_or_false(name):
-    with pytest.raises(SettingsError, match=f"render settings: {name} must be True or False, got 'yes'"):
-        RenderSettings(**{name: "yes"})
 
 
 def test_a_sparse_pose_is_one():

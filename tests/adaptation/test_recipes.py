@@ -25,11 +25,6 @@ def test_a_time_budget_begins_as_crisp_as_without():
     assert recipe("default", 2, time_budget_s=3.0).crispness == recipe("default", 2).crispness
 
 
-def test_an_unknown_recipe_is_told_the_known_ones():
-    with pytest.raises(SettingsError, match="there is no recipe 'best'; choose from default, instant, paper, thorough"):
-        recipe("best", 2)
-
-
 def test_what_is_no_recipe_is_named():
     register_recipe("mine", 3)
     with pytest.raises(PluginError, match="recipe 'mine' is of type int"):
