@@ -23,21 +23,25 @@ from mipmap_plugin.wrap import Interrupted
 pytestmark = pytest.mark.usefixtures("brief_ladders", "few_views")
 
 
+def refused(base, asked, state):
+    """These levels are not gone on with."""
+    with pytest.raises(SettingsError, match="holds levels of another base, viewer or settings"):
+        make_levels(base, asked, resume=state)
+
+
 @pytest.mark.parametrize("change", [{"split": "test"}, {"time": 0.5}, {"width": 33}])
 def test_levels_of_other_cameras_are_not_gone_on_with(tmp_path, change):
     base = wrapped()
     make_levels(base, request(coarsest=0.9), tmp_path / "state")
     base.cameras[-1] = replace(base.cameras[-1], **change)
-    with pytest.raises(SettingsError, match="holds levels of another base, viewer or settings"):
-        make_levels(base, request(coarsest=0.9), tmp_path / "state")
+    refused(base, request(coarsest=0.9), tmp_path / "state")
 
 
 def test_levels_of_another_vertical_are_not_gone_on_with(tmp_path):
     base, other = (wrap_model(tiny.model(), up=up) for up in ("z", None))
     asked = request(coarsest=0.9, steps=0, extra_views=2)
     make_levels(base, asked, tmp_path / "state")
-    with pytest.raises(SettingsError, match="holds levels of another base, viewer or settings"):
-        make_levels(other, asked, tmp_path / "state")
+    refused(other, asked, tmp_path / "state")
 
 
 def test_levels_of_another_model_are_not_gone_on_with(tmp_path):
@@ -46,8 +50,7 @@ def test_levels_of_another_model_are_not_gone_on_with(tmp_path):
     with torch.no_grad():
         other.model.parameters()["means"].copy_(first.model.parameters()["means"].flip(0))
     make_levels(first, request(coarsest=0.9), tmp_path / "state")
-    with pytest.raises(SettingsError, match="holds levels of another base, viewer or settings"):
-        make_levels(other, request(coarsest=0.9), tmp_path / "state")
+    refused(other, request(coarsest=0.9), tmp_path / "state")
 
 
 def test_levels_of_a_bound_are_made_again_for_narrower_bands():
@@ -187,8 +190,7 @@ def test_levels_that_another_run_kept_meanwhile_are_not_mixed_with_these(tmp_pat
         return adapt(scale, **options)
 
     monkeypatch.setattr(base, "adapt", overtaken)
-    with pytest.raises(SettingsError, match="levels of another base, viewer or settings"):
-        make_levels(base, request(), resume=tmp_path / "state")
+    refused(base, request(), tmp_path / "state")
 
 
 def test_a_damaged_unfinished_ladder_is_told(tmp_path):
@@ -209,17 +211,14 @@ def test_levels_of_another_ladder_are_not_taken(tmp_path, monkeypatch):
     monkeypatch.setattr(base, "adapt", lambda scale, **options: adapt(scale, **options) if scale == 1 else interrupt())
     with pytest.raises(Interrupted):
         make_levels(base, request(), resume=tmp_path / "state")
-    with pytest.raises(SettingsError, match="levels of another base, viewer or settings"):
-        make_levels(wrapped(), request(coarsest=1 / 8), resume=tmp_path / "state")
-    with pytest.raises(SettingsError, match="levels of another base, viewer or settings"):
-        make_levels(on_backend(wrapped(), "reference"), request(), resume=tmp_path / "state")
-    (tmp_path / "state" / "request.json").write_text("")
-    with pytest.raises(SceneError, match=r"request\.json: is not JSON"):
-        make_levels(wrapped(), request(), resume=tmp_path / "state")
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "file").write_text("mine")
+    refused(wrapped(), request(coarsest=1 / 8), tmp_path / "state")
+    refused(on_backend(wrapped(), "reference"), request(), tmp_path / "state")
+
+
+def test_a_folder_with_other_things_is_not_taken_for_levels(tmp_path):
+    (tmp_path / "file").write_text("mine")
     with pytest.raises(SettingsError, match="it has other things in it"):
-        make_levels(wrapped(), request(), resume=tmp_path / "other")
+        make_levels(wrapped(), request(), resume=tmp_path)
 
 
 @pytest.mark.parametrize("by", ["zoom", "distance"])

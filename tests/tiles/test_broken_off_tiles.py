@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import contextmanager
 from dataclasses import replace
 from unittest.mock import Mock
 
@@ -25,6 +26,10 @@ from mipmap_plugin.tiles.folder import truth_file, work_folder
 from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
 from mipmap_plugin.tiles.store import Store
 from mipmap_plugin.tiles.sweeps import Sweep
+
+
+def columns_of(file):
+    return {name: column.tobytes() for name, column in read_ply(file).columns.items()}
 
 
 def test_the_result_does_not_depend_on_what_was_done_before(job, monkeypatch):
@@ -53,8 +58,7 @@ def test_the_result_does_not_depend_on_what_was_done_before(job, monkeypatch):
     assert tiles == ["finished before", "done", "finished before"]
     before = [outcome.status for outcome in outcomes if outcome.job.work not in ("tile", "steering") and outcome.job.sweep == 0]
     assert set(before) == {"finished before"}
-    assert read_ply(joined.file).columns["x"].tobytes() == read_ply(undisturbed).columns["x"].tobytes()
-    assert read_ply(joined.file).columns["f_rest_0"].tobytes() == read_ply(undisturbed).columns["f_rest_0"].tobytes()
+    assert columns_of(joined.file) == columns_of(undisturbed)
 
 
 def test_an_interrupted_tile_is_resumed(job, monkeypatch):
@@ -154,10 +158,6 @@ def interrupted_at(work, sweep, number):
     return engine
 
 
-def columns_of(file):
-    return {name: column.tobytes() for name, column in read_ply(file).columns.items()}
-
-
 @pytest.mark.parametrize(
     ("work", "sweep", "number"), [("tile", 1, 1), ("steering", 1, 0), ("tile", 2, 1), ("steering", 2, 0), ("halo", 3, 0), ("tile", 3, 2)]
 )
@@ -189,11 +189,19 @@ def test_a_scale_that_is_interrupted_leaves_the_others_what_they_share(job, monk
     assert first.file.exists() and adapt_in_tiles(jobs[1], 2).file.exists() and not sizes
 
 
+@contextmanager
+def killed_as_it_appears(output, monkeypatch):
+    """A run that writes it ends with what it has left open, and removes nothing."""
+    close = staging.Staging.close
+    with monkeypatch.context() as patched:
+        patched.setattr(staging.Staging, "close", lambda self: os.close(self._lock) if self.path == output else close(self))
+        yield patched
+
+
 def test_a_run_that_is_killed_while_it_deletes_its_tiles_is_in_nobodys_way(job, monkeypatch):
     """What was left of them had no plan, and was taken for other things."""
-    job, close = replace(job, settings=job.settings | {"steps": 0}, overwrite=True), staging.Staging.close
-    with monkeypatch.context() as patched:
-        patched.setattr(staging.Staging, "close", lambda self: os.close(self._lock) if self.path == job.target else close(self))
+    job = replace(job, settings=job.settings | {"steps": 0}, overwrite=True)
+    with killed_as_it_appears(job.target, monkeypatch):
         adapt_in_tiles(job, 2)
     assert not work_folder(job.target).exists() and list(job.target.parent.glob(".out.ply.?.tmp"))
     adapt_in_tiles(job, 2)
@@ -239,9 +247,7 @@ def test_what_a_run_that_was_killed_at_its_plan_leaves_is_in_nobodys_way(job):
 
 def test_the_lock_of_tiles_goes_with_them(job, monkeypatch):
     """Also where the run is killed as its output appears."""
-    close = staging.Staging.close
-    with monkeypatch.context() as patched:
-        patched.setattr(staging.Staging, "close", lambda self: os.close(self._lock) if self.path == job.target else close(self))
+    with killed_as_it_appears(job.target, monkeypatch) as patched:
         patched.setattr(plan, "release", lambda folder, lock: os.close(lock))
         adapt_in_tiles(replace(job, settings=job.settings | {"steps": 0}), 2)
     with pytest.raises(OutputExists):
