@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import tiny
@@ -147,7 +148,7 @@ def test_what_another_recipe_of_that_name_made_is_measured_again(folder, monkeyp
 def test_a_command_that_ends_between_its_two_files_is_not_in_its_own_way(folder, capsys, monkeypatch):
     words = ["evaluate", str(folder / "base"), "--images", str(folder / "scene"), "--scale", "1/2", "--output", str(folder / "rows.json")]
     with monkeypatch.context() as failing:
-        failing.setattr("mipmap_plugin.commands.evaluate.write_json", lambda *_: (_ for _ in ()).throw(OutputError("the disk is full")))
+        failing.setattr("mipmap_plugin.commands.evaluate.write_json", Mock(side_effect=OutputError("the disk is full")))
         assert main(words) == 2
     assert main(words) == 0, capsys.readouterr().err
     assert {path.name for path in folder.iterdir()} == {"base", "scene", "rows.json", "rows.html"}

@@ -3,6 +3,7 @@
 import os
 import shutil
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import tiny
@@ -85,12 +86,8 @@ def test_an_interrupted_command_says_that_finished_levels_are_kept(tmp_path, mon
     base = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12), count=12)
     words = ["levels", str(base), "--viewer", "antialiased", "--output", str(tmp_path / "ladder"), "--coarsest", "1/2", "--recipe", "instant"]
     words += ["--views", "given"]
-
-    def ends(*_):
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as first:
-        first.setattr("mipmap_plugin.levels.ladder._curve", ends)
+        first.setattr("mipmap_plugin.levels.ladder._curve", Mock(side_effect=KeyboardInterrupt))
         assert cli.main(words) == 130
         assert f"go on with the levels that {tmp_path / 'ladder.resume'} keeps" in capsys.readouterr().err
     monkeypatch.setattr("mipmap_plugin.wrap.Wrapped.adapt", None)
@@ -104,24 +101,21 @@ def interrupt():
 @pytest.mark.parametrize("by", ["zoom", "distance"])
 def test_a_ladder_that_failed_before_its_first_level_leaves_nothing(tmp_path, monkeypatch, by):
     base = wrapped()
-    monkeypatch.setattr(base, "adapt", lambda *_, **__: interrupt())
+    monkeypatch.setattr(base, "adapt", Mock(side_effect=Interrupted("Ctrl-C")))
     with pytest.raises(Interrupted):
         make_levels(base, request(by=by), resume=tmp_path / "new" / "state")
     assert not (tmp_path / "new").exists()
 
 
 def test_a_first_level_that_is_broken_off_before_its_state_leaves_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr(Run, "start", lambda *_: interrupt())
+    monkeypatch.setattr(Run, "start", Mock(side_effect=Interrupted("Ctrl-C")))
     with pytest.raises(Interrupted):
         make_levels(wrapped(), request(), resume=tmp_path / "new" / "state")
     assert not (tmp_path / "new").exists()
 
 
 def test_a_first_level_whose_state_cannot_be_written_leaves_nothing(tmp_path, monkeypatch):
-    def full(*_):
-        raise OutputError("no space")
-
-    monkeypatch.setattr("mipmap_plugin.adaptation.optimization.resume.save_run", full)
+    monkeypatch.setattr("mipmap_plugin.adaptation.optimization.resume.save_run", Mock(side_effect=OutputError("no space")))
     monkeypatch.setattr("mipmap_plugin.adaptation.session.adapt", lambda run, task, config, on_interrupt, observe: on_interrupt(run))
     with pytest.raises(OutputError, match="no space"):
         make_levels(wrapped(), request(), resume=tmp_path / "new" / "state")
@@ -232,7 +226,7 @@ def test_an_export_that_failed_is_made_by_the_same_command(tmp_path, monkeypatch
     words = ["levels", str(tiny.folder(tmp_path / "base", tiny.cameras(2))), "--viewer", "antialiased", "--coarsest", "1", "--by", "zoom", "--recipe"]
     words += ["instant", "--output", str(tmp_path / "ladder")]
     with monkeypatch.context() as failing:
-        failing.setattr(Exports, "write", lambda *_: (_ for _ in ()).throw(OutputError("the disk is full")))
+        failing.setattr(Exports, "write", Mock(side_effect=OutputError("the disk is full")))
         assert cli.main(words) == 2
     assert "ladder has the levels, and the same command goes on from these" in capsys.readouterr().err
     (tmp_path / "ladder" / ".report.html.0.tmp" / "new").mkdir(parents=True)

@@ -36,7 +36,7 @@ def tool_request(tool):
 
 def answer_by(tool, script, name="splat-transform"):
     """Have a few lines of Python answer in place of the stand-in."""
-    (tool / name).write_text(f"#!{sys.executable}\nimport os, sys\n{script}\n")
+    (tool / name).write_text(f"#!{sys.executable}\nimport os, sys\n{script}\n", encoding="utf-8")
     (tool / name).chmod(0o755)
 
 

@@ -81,10 +81,6 @@ def test_tiles_of_another_request_are_not_touched(job):
         adapt_in_tiles(job, 2)
 
 
-def failing(*_):
-    raise OSError("no space left")
-
-
 def test_tiles_of_a_version_that_cut_across_sizes_are_refused(job):
     """They ended in an error wherever a plane lay across an axis that is none."""
     work_folder(job.target).mkdir()
@@ -98,7 +94,7 @@ def test_tiles_of_a_version_that_cut_across_sizes_are_refused(job):
 def test_tiles_are_not_gone_on_with_for_other_cameras(job, monkeypatch):
     """Whose path is the same."""
     with monkeypatch.context() as patched, pytest.raises(JobsFailed):
-        patched.setattr(tile, "adapt", failing)
+        patched.setattr(tile, "adapt", Mock(side_effect=OSError("no space left")))
         adapt_in_tiles(job, 2)
     (job.base.checkpoint / "cameras.json").unlink()
     write_cameras(job.base.checkpoint / "cameras.json", tiny.cameras(3, seed=5, width=20, height=16))
@@ -111,7 +107,7 @@ def test_saving_the_base_leaves_the_starts_to_the_next_run(job, monkeypatch):
     folder = work_folder(job.target)
     with monkeypatch.context() as patched, pytest.raises(OSError, match="no space left"):
         patched.setattr(run, "judged", lambda scene: ({}, AS_IT_IS))
-        patched.setattr(run, "_save", failing)
+        patched.setattr(run, "_save", Mock(side_effect=OSError("no space left")))
         adapt_in_tiles(job, 2)
     starts = Store(folder / "start_0.splats").parameters()["opacities"]
     assert not torch.equal(starts, load_vanilla(folder / "part_0.ply").parameters()["opacities"])
@@ -219,7 +215,7 @@ def test_no_folder_is_claimed_if_one_cannot_be(job):
 
 def test_a_disk_that_is_full_before_the_base_is_cut_leaves_no_plan_behind(job, monkeypatch):
     """Which would refuse other settings, for tiles that are not there."""
-    monkeypatch.setattr(plan, "make_cut", lambda *_: (_ for _ in ()).throw(OutputError("no space left")))
+    monkeypatch.setattr(plan, "make_cut", Mock(side_effect=OutputError("no space left")))
     with pytest.raises(OutputError, match="no space left"):
         next(adapt_all_in_tiles([job], 2))
     assert not work_folder(job.target).exists()
