@@ -56,11 +56,6 @@ def test_evaluate_says_where_a_file_is_adapted_to_images_of_another_filter_than_
     assert [len(each) for each in notes] == [1, 0, 0] and notes[0][0].startswith(told)
 
 
-def test_evaluate_as_json(run, model_folder, tmp_path):
-    code, out, _ = run("evaluate", model_folder, "--images", tiny.scene(tmp_path / "scene"), "--scale", "1", "--json")
-    assert code == 0 and json.loads(out)["rows"][0]["name"] == "base"
-
-
 def test_evaluate_says_which_rows_are_missing_and_that_no_row_is_exposed(run, model_folder, tmp_path, monkeypatch):
     few = replace(ReferenceBackend.capabilities, screen_filters=frozenset({"classic", "antialiased"}))
     monkeypatch.setattr(ReferenceBackend, "capabilities", few)

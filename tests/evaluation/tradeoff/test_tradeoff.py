@@ -5,6 +5,7 @@ import json
 import re
 import time
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import tiny
@@ -284,10 +285,7 @@ def test_ctrl_c_keeps_what_was_measured_and_says_where(tmp_path, monkeypatch, ca
 
 
 def test_ctrl_c_before_the_first_point_writes_nothing(tmp_path, monkeypatch):
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(measuring, "_measured", stop)
+    monkeypatch.setattr(measuring, "_measured", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         run(wrapped(), None, [1 / 4], PLAN, 1, Folder(tmp_path / "new", picture=False, overwrite=False))
     assert not (tmp_path / "new").exists()
