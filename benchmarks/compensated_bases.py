@@ -26,7 +26,7 @@ from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import Wrapped
 
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "support"))
 
 import mip_checkpoints
 

@@ -22,7 +22,7 @@ import tyro
 from scenes import Name, make
 from torch import Tensor
 
-sys.path.append(str(Path(__file__).parents[1] / "tests"))  # its modules import one another by bare names
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "support"))  # its modules import one another by bare names
 
 import anchor_checkpoints
 import moving

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-sys.path.append(str(Path(__file__).parents[1] / "tests"))  # its modules import one another by bare names
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "support"))  # its modules import one another by bare names
 
 import anchor_checkpoints
 import mip_checkpoints

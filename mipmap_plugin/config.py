@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
+from mipmap_plugin.errors import SettingsError, type_of
 from mipmap_plugin.limits import MAX_SEED
 
 ResizeFilter = Literal["fitting", "box", "area", "bilinear", "pil-bicubic", "lanczos"]
@@ -18,10 +20,32 @@ Factor = Annotated[float, Field(gt=0)]
 Momentum = Annotated[float, Field(ge=0, lt=1)]
 
 
-class LearningRates(BaseModel):
-    """Adam's learning rate for each raw parameter, named as in a gsplat checkpoint. A parameter of rate 0 does not change."""
+# What is said of a base when it is wrapped, and not of each adaptation.
+OF_THE_BASE = ("backend", "threads", "background", "screen_filter", "up")
+
+# Characters of a wrong value that a message quotes; of a longer one, such as a list of cameras, it names the type.
+LONGEST = 80
+
+
+class Settings(BaseModel):
+    """Settings by name."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    owner: ClassVar[str] = ""  # what the names of these are behind, in messages
+
+    def __init__(self, **settings: Any) -> None:
+        """Raises SettingsError for a name that is unknown and a value out of range."""
+        try:
+            super().__init__(**settings)
+        except ValidationError as error:
+            told = dict.fromkeys(_told(type(self), each, settings) for each in error.errors())  # of a pair, whose parts may both be wrong, once
+            raise SettingsError("; ".join(told)) from None
+
+
+class LearningRates(Settings):
+    """Adam's learning rate for each raw parameter, named as in a gsplat checkpoint. A parameter of rate 0 does not change."""
+
+    owner = "rates."
 
     means: float = Field(
         default=0.0, ge=0, description="Target pixels at the median splat, so that steps on the screen are the same for scenes of any size."
@@ -36,10 +60,8 @@ class LearningRates(BaseModel):
     networks: float = Field(default=0.0, ge=0, description="Of the networks that all anchors share; a deformation network never changes.")
 
 
-class AdaptConfig(BaseModel):
+class AdaptConfig(Settings):
     """How one checkpoint is adapted to one scale."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     recipe: str = Field(default="default", description="The name of the recipe that these settings started from.")
     steps: int = Field(default=1000, ge=0, description="Maximum number of optimizer steps.")
@@ -156,6 +178,13 @@ class AdaptConfig(BaseModel):
             raise ValueError("must be the name of an upsampler, which register_upsampler gives to a function")
         return str(upsampler) if isinstance(upsampler, Path) else upsampler
 
+    @field_validator("rates", mode="before")
+    @classmethod
+    def _rates_are_named(cls, rates: Any) -> Any:
+        if isinstance(rates, Mapping) and not all(isinstance(name, str) for name in rates):  # which Python itself refuses as keywords
+            raise ValueError(f"must be {WORDS[LearningRates]}")
+        return rates
+
     @field_validator("band")
     @classmethod
     def _band_rises(cls, band: tuple[float, float]) -> tuple[float, float]:
@@ -167,6 +196,21 @@ class AdaptConfig(BaseModel):
     def warm_up_steps(self) -> int:
         """The number of steps of the warm-up."""
         return math.ceil(self.warm_up * self.steps)
+
+
+def _told(kind: type[Settings], error: Any, given: Mapping[str, Any]) -> str:
+    """One error of pydantic's in settings that were given, in a sentence."""
+    name = str(error["loc"][0])
+    if error["type"] == "extra_forbidden":
+        if name in OF_THE_BASE:
+            return f"{name} is no setting of an adaptation; give it to wrap_model"
+        meant = get_close_matches(name, kind.model_fields, 1)
+        return f"there is no setting {kind.owner}{name}; {f'did you mean {meant[0]}? ' if meant else ''}mipmap_plugin.config has all of them"
+    own = error["ctx"]["error"] if error["type"] == "value_error" else f"must be {allowed(kind.owner + name)}"
+    if isinstance(own, SettingsError):  # of settings within these
+        return str(own)
+    said = repr(given[name])
+    return f"setting {kind.owner}{name}: {own}, got {said if len(said) <= LONGEST else type_of(given[name])}"
 
 
 # What a value of each type is in words.

@@ -192,6 +192,8 @@ class FrozenBase:
         views = {} if cameras is None else {"views": digest_of(cameras)}
         inputs = self.asked | views | ({"photographs": scene.digest()} if scene else {}) | network_input(config.upsampler)
         photographs = Photographs(there, self.cameras, self.background) if there else None
+        if photographs:
+            photographs.warn_of_others(self.render)
         cameras = (photographs or self).cameras if cameras is None else cameras
         needs = [replace(self._needs, screen_filter=target.screen_filter, settings=target.settings) for target in targets.values()]
         backend, note, has_gradients = choose(self._backend, config, needs, self._needs)

@@ -9,7 +9,8 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
-from mipmap_plugin.errors import ShapeError
+from mipmap_plugin.errors import SettingsError, ShapeError, brief, type_of
+from mipmap_plugin.limits import is_out_of_memory
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -38,7 +39,7 @@ class Gaussians:
         if wrong := [name for name, tensor in given.items() if not isinstance(tensor, Tensor) and (tensor is not None or name != "covariances")]:
             raise ShapeError(f"{wrong[0]}: expected a torch tensor, got {type(given[wrong[0]]).__name__}")
         if wrong := [name for name, tensor in given.items() if tensor is not None and (tensor.layout != torch.strided or tensor.is_nested)]:
-            raise ShapeError(f"{wrong[0]}: expected a dense tensor, got a sparse or nested one; give its to_dense()")
+            raise ShapeError(f"{wrong[0]}: expected a dense tensor, got a sparse or nested one; give a dense copy of it")
         if not self.means.is_floating_point():
             raise ShapeError(f"means: expected floating-point numbers, got {self.means.dtype}; give float32")
         n = self.means.shape[0] if self.means.dim() else 0
@@ -54,19 +55,24 @@ class Gaussians:
                 raise ShapeError(f"{name}: {tensor.dtype} on {tensor.device}, but means are {self.means.dtype} on {self.means.device}")
 
     def __repr__(self) -> str:
-        kind = f"{str(self.means.dtype).removeprefix('torch.')} on {self.means.device}"
+        return f"<Gaussians: splats {len(self):,}, {self._kind()}>"
+
+    def _kind(self) -> str:
+        """What splats have in common that can be joined."""
         covariances = "" if self.covariances is None else ", with covariances"
-        return f"<Gaussians: splats {len(self):,}, SH degree {self.sh_degree}, {kind}{covariances}>"
+        return f"SH degree {self.sh_degree}, {str(self.means.dtype).removeprefix('torch.')} on {self.means.device}{covariances}"
 
     def __len__(self) -> int:
         return self.means.shape[0]
 
     def __getitem__(self, rows: Tensor | slice) -> Gaussians:
-        """The splats at `rows`, a boolean mask [N], indices or a slice. Raises IndexError for a mask of another length."""
+        """The splats at `rows`, a boolean mask [N], indices or a slice. Raises IndexError for a mask of another length, ShapeError."""
         if isinstance(rows, Tensor) and rows.dtype == torch.bool:
             if rows.shape != (len(self),):
                 raise IndexError(f"a mask of {len(self)} splats has shape [{len(self)}], not {list(rows.shape)}")
             rows = rows.nonzero()[:, 0]  # once for all tensors: a GPU is waited for
+        if not isinstance(rows, (slice, list)) and getattr(rows, "ndim", 0) != 1:
+            raise ShapeError(f"splats are chosen by a mask, a list of indices or a slice, got {type_of(rows)}; one splat is a list of one index")
         return self._map(lambda tensor: tensor[rows])
 
     def tensors(self) -> dict[str, Tensor]:
@@ -75,12 +81,19 @@ class Gaussians:
         return {name: tensor for name, tensor in held.items() if tensor is not None}
 
     def joined(self, other: Gaussians) -> Gaussians:
-        """These splats, then those of `other`, which has covariances if these have."""
+        """These splats, then those of `other`, which are of the same kind. Raises ShapeError."""
+        if not isinstance(other, Gaussians) or self._kind() != other._kind():
+            raise ShapeError(f"only splats of one kind can be joined ({self._kind()}), got {other!r}")
         return replace(self, **{name: torch.cat([tensor, getattr(other, name)]) for name, tensor in self.tensors().items()})
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Gaussians:
-        """The same splats on `device` in `dtype`."""
-        return self._map(lambda tensor: tensor.to(device=device, dtype=dtype))
+        """The same splats on `device` in `dtype`. Raises SettingsError for a device that is not here, ShapeError for integers."""
+        try:
+            return self._map(lambda tensor: tensor.to(device=device, dtype=dtype))
+        except (RuntimeError, TypeError, AssertionError) as error:  # by which torch tells of a build without CUDA
+            if is_out_of_memory(error):
+                raise
+            raise SettingsError(f"splats cannot be moved (device={device!r}, dtype={dtype!r}): {brief(error)}") from error
 
     def detach(self) -> Gaussians:
         """The same splats outside the gradient graph."""

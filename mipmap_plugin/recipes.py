@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from difflib import get_close_matches
 from typing import Any
 
-from pydantic import ValidationError
-
-from mipmap_plugin.config import AdaptConfig, LearningRates, allowed
+from mipmap_plugin.config import AdaptConfig, LearningRates
 from mipmap_plugin.errors import PluginError, SettingsError, type_of
 from mipmap_plugin.limits import check_scale
 from mipmap_plugin.registry import Registry
@@ -41,12 +38,6 @@ MOST_DRAWS = 1.8e8
 # The zoom from which on a picture shows more than the base's own. Below it steps only learn to undo the filter that shrinks their picture: on
 # photographs of chair they lose 0.6 dB against the closed form at x1.02, 0.2 dB at x1.05, nothing at x1.1, and from there on they gain.
 LEAST_ZOOM_IN = 1.1
-
-# What is said of a base when it is wrapped, and not of each adaptation.
-OF_THE_BASE = ("backend", "threads", "background", "screen_filter", "up")
-
-# Characters of a wrong value that a message quotes; of a longer one, such as a list of cameras, it names the type.
-LONGEST = 80
 
 # What a run ends by at the user's wish: then `most_draws` does not, and there are steps at any zoom.
 ENDS = ("steps", "time_budget_s", "target_db")
@@ -124,17 +115,16 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
         raise PluginError(f"recipe {name!r} failed at x{scale:g}: {type(error).__name__}: {error}") from error
     if not isinstance(made, Mapping):
         raise PluginError(f"recipe {name!r} has to return a dict of settings; at x{scale:g} it returned {type_of(made)}")
-    settings = {**made}
+    settings = {"recipe": name, **made}
+    try:
+        AdaptConfig(**settings)
+    except SettingsError as error:
+        raise SettingsError(f"recipe {name}: {error}") from None
     if any(overrides.get(end) is not None for end in ENDS):
         settings |= {"most_draws": None, "least_zoom_in": 1.0}
     if overrides.get("steps") is not None:
         settings.pop("most_steps", None)
-    try:
-        config = AdaptConfig(**(given := {"recipe": name, **settings, **overrides}))
-    except ValidationError as error:
-        asked = all(each["loc"][0] in overrides for each in error.errors())
-        told = dict.fromkeys(_told(each, given) for each in error.errors())  # of a pair, whose parts may both be wrong, once
-        raise SettingsError(f"{'' if asked else f'recipe {name}: '}{'; '.join(told)}") from None
+    config = AdaptConfig(**(settings | overrides))
     if config.band != (1, 1) and scale * config.band[1] > HIGHEST:
         raise SettingsError(f"band: x{scale:g} would be shown up to x{scale * config.band[1]:g}, but a band ends at the base's scale, x1")
     return config
@@ -143,22 +133,6 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
 def most_steps(name: str, scale: float, steps: int | None) -> int | None:
     """A maximum of steps of several recipes that are compared, as the setting of one: None where it has no steps, for a maximum adds none."""
     return None if steps is None or recipe(name, scale).steps == 0 else steps
-
-
-def _told(error: Any, given: Mapping[str, Any]) -> str:
-    """One error of pydantic's in settings that were given, in a sentence."""
-    name, *within = error["loc"]
-    got, known = given[name], AdaptConfig.model_fields
-    if within and name == "rates" and error["type"] != "invalid_key":
-        name, got, known = f"rates.{within[0]}", error["input"], LearningRates.model_fields
-    if error["type"] == "extra_forbidden":
-        if name in OF_THE_BASE:
-            return f"{name} is no setting of an adaptation; give it to wrap_model"
-        meant = get_close_matches(str(error["loc"][-1]), known, 1)
-        return f"there is no setting {name}; {f'did you mean {meant[0]}? ' if meant else ''}mipmap_plugin.config has all of them"
-    own = str(error["ctx"]["error"]) if error["type"] == "value_error" else f"must be {allowed(name)}"
-    said = repr(got)
-    return f"setting {name}: {own}, got {said if len(said) <= LONGEST else type_of(got)}"
 
 
 def scale_of_fraction(kept: float) -> float:

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
-from importlib.metadata import EntryPoint, distributions, entry_points
+from importlib.metadata import Distribution, EntryPoint, distributions, entry_points
 from typing import Any
 
 from mipmap_plugin.errors import PluginError, SettingsError, brief, unknown
@@ -63,7 +63,7 @@ class Registry:
         """What installed packages have under each name, such as "package.module:Name of my-package 1.0"; the first of each is used."""
         found: dict[str, list[str]] = {}
         for point in entry_points(group=self.group):
-            found.setdefault(point.name, []).append(f"{point.value}{_package(point)}")
+            found.setdefault(point.name, []).append(f"{point.value} of {_told(point.dist)}" if point.dist else point.value)
         return {name: list(dict.fromkeys(places)) for name, places in found.items()}
 
     def is_taken(self, name: str) -> bool:
@@ -80,13 +80,15 @@ def unreadable_package() -> str:
         try:
             package.entry_points  # noqa: B018
         except Exception as error:
-            name = f"{package.metadata['Name']} {package.version}"
-            return f"the entry points of the installed package {name} cannot be read ({brief(error)}); install it anew, or remove it"
+            return f"the entry points of the installed package {_told(package)} cannot be read ({brief(error)}); install it anew, or remove it"
     return ""
 
 
-def _package(point: EntryPoint) -> str:
-    return f" of {point.dist.name} {point.dist.version}" if point.dist else ""
+def _told(package: Distribution) -> str:
+    """The name and the version of an installed package; of one without METADATA, as a broken installation leaves, its folder."""
+    if package.metadata:
+        return f"{package.metadata['Name']} {package.version}"
+    return str(getattr(package, "_path", package.locate_file("")))
 
 
 @lru_cache(maxsize=64)

@@ -15,10 +15,11 @@ from typing_extensions import TypedDict, Unpack
 from mipmap_plugin.adaptation.adapted import Adapted as Adapted
 from mipmap_plugin.adaptation.cameras_of_base import own_cameras, where
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
+from mipmap_plugin.adaptation.target.other_world import doubt_about
 from mipmap_plugin.adaptation.target.photographs import placed
 from mipmap_plugin.backends import BACKENDS, device_for
 from mipmap_plugin.camera import Camera, digest_of, of_base_scale
-from mipmap_plugin.errors import SettingsError, warn
+from mipmap_plugin.errors import MipmapPluginError, SettingsError, warn
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.frozen_base import RenderOptions as RenderOptions
 from mipmap_plugin.levels.finished import Ladder
@@ -96,8 +97,11 @@ def wrap_model(
     given = found.cameras if isinstance(found, Scene) else found
     if up is not None and given:
         warn(f"up {up}: there are cameras, whose views are taken; it is of use only where an orbit is asked for (views 'orbit')")
-    wrapped = Wrapped(model, placed(model, found).cameras if isinstance(found, Scene) else given, backend, trained, threads)
+    there = placed(model, found) if isinstance(found, Scene) else None
+    wrapped = Wrapped(model, there.cameras if there else given, backend, trained, threads)
     wrapped.loading_s, wrapped.asked, wrapped.cameras_from = loading_s, asked_for(model.folder, given, color, screen_filter, up), read_from
+    if cameras is not None and there is not None:
+        _warn_of_others(wrapped, there)
     return wrapped
 
 
@@ -128,6 +132,16 @@ def _found(model: SplatModel, cameras: Sequence[Camera] | Scene | str | Path | N
     if cameras is not None:
         return of_base_scale(cameras), {}
     return own_cameras(model.source, model.folder)
+
+
+def _warn_of_others(wrapped: Wrapped, scene: Scene) -> None:
+    """Warn if the photographs of the scene whose cameras are given, in the model's frame, do not show what it does."""
+    try:
+        doubt = doubt_about([*scene.images], lambda camera: scene.image(camera, wrapped.background), wrapped.render, wrapped.background, "--cameras")
+    except MipmapPluginError:  # such as a damaged photograph, which cameras do without
+        return
+    if doubt:
+        warn(doubt)
 
 
 def asked_for(

@@ -129,12 +129,14 @@ class _Results:
         """Add the means over several scenes, write the page and the JSON as far as requested, and return what the JSON holds."""
         from mipmap_plugin.evaluation.evaluate import means
         from mipmap_plugin.evaluation.report import records
+        from mipmap_plugin.models.places import page_at
 
         self._rows += means(self._rows) if 1 < len(checkpoints) == len(set(self._scenes)) else []  # several of one scene are compared
         facts = {"rows": records(self._rows), "judged_views": self.judged, "notes": [*self._notes], "report": self._page and str(self._page)}
         written = self._output or self._page
-        kept = [self.kept] if self.kept else []
-        with together(written, kept) if written else nullcontext():  # or else, after a kill between the two, one would be in the way
+        older = page_at(self._output.with_suffix(".html")) if self._output and self._output.exists() else []  # it shows the rows that are replaced
+        spent = [*([self.kept] if self.kept else []), *older]
+        with together(written, spent) if written else nullcontext():  # or else, after a kill between the two, one would be in the way
             if self._page:
                 write_evaluation_page(self._page, checkpoints, self._galleries, self._rows, [*self._notes], overwrite)
             if self._output:

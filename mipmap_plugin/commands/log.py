@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TextIO
 
 from mipmap_plugin.errors import OutputError
+from mipmap_plugin.formats.atomic import refuse_named_pipe
 
 # How every line begins: by it a file is known to be a log, and not one that was named by mistake, such as a checkpoint.
 BEGINNING = re.compile(rb"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d ")
@@ -23,6 +24,7 @@ class Log:
         self._path = path
         self._file: TextIO | None
         try:
+            refuse_named_pipe(path)
             self._file = path.open("a", encoding="utf-8", errors="backslashreplace") if _may_be_a_log(path) else None
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or error

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
@@ -14,7 +17,7 @@ from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, OwnScale, Up, Viewer
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError, plural, warn
-from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
+from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, settled, together, write_json
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.progress import counted
 from mipmap_plugin.screen_filters import Name
@@ -26,6 +29,9 @@ if TYPE_CHECKING:
 
 # Endings of pictures, which no folder is called by.
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
+
+# The file in the folder of the pictures that lists the finished ones until all are there, by a hash of what they depend on.
+RECORD = "render_{}.resume"
 
 
 def render(
@@ -76,17 +82,25 @@ def render(
     outputs = [name for name, requested in {"depth": depth, "normals": normals}.items() if requested]
     told = [replace(camera, name=f"{camera.name}_t{camera.time:g}") for camera in views] if len(time) > 1 else views
     pictures = [output / name for name in picture_names(told)]
-    _refuse(wrapped, pictures, outputs, overwrite)
-    _check(wrapped, views, exposure)
     # Samples are clamped as `evaluate` clamps them, except those that an exposure may still bring into the range of a picture.
     options: RenderOptions = {"viewer": viewer, "filter_3d": filter_3d, "outputs": outputs, "exposure": exposure, "clamped": not exposure}
-    for camera, picture in counted(zip(views, pictures, strict=True), len(views), "rendering", "view"):
-        _write(picture, wrapped.render(camera.zoomed(zoom), zoom, filter_name, supersampling, **options), outputs, overwrite)
-    count = plural(len(views), "picture")
-    say(f"{count} in {output}{_told_by_file(zoom if scale is None else 1.0, own_viewer)}")
+    record = output / RECORD.format(_hash(wrapped, views, (zoom, filter_name, supersampling, backend, options)))
+    finished = _finished(record)
+    left = [(view, picture) for view, picture in zip(views, pictures, strict=True) if picture.name not in finished or not picture.is_file()]
+    _refuse(wrapped, [picture for _, picture in left], outputs, overwrite)
+    _check(wrapped, views, exposure)
+    with _kept(record, finished):
+        for camera, picture in counted(left, len(left), "rendering", "view"):
+            _write(picture, wrapped.render(camera.zoomed(zoom), zoom, filter_name, supersampling, **options), outputs, overwrite, record, finished)
+    say(f"{plural(len(views), 'picture')} in {output}{_told_by_file(zoom if scale is None else 1.0, own_viewer)}")
+    _tell_of_cameras(wrapped, cameras)
+
+
+def _tell_of_cameras(wrapped: Wrapped, given: Path | None) -> None:
+    """Say where the views come from, unless it is the scene itself."""
     if not wrapped.cameras:
         say(f"seen from a generated orbit, {wrapped.viewpoints.orbit.told()}; --cameras gives the scene's own cameras")
-    if place := base_cameras(wrapped, cameras):
+    if place := base_cameras(wrapped, given):
         say(f"seen by the cameras of its base, in {place}; --cameras gives others")
 
 
@@ -155,6 +169,34 @@ def _folder(output: Path) -> Path:
     return output
 
 
+def _hash(wrapped: Wrapped, views: Sequence[Camera], how: tuple[Any, ...]) -> str:
+    """A hash of everything that the pictures depend on."""
+    from mipmap_plugin.adaptation.report import versions
+    from mipmap_plugin.camera import DIGITS, digest_of
+    from mipmap_plugin.models.base import digest_of_model
+
+    facts = [digest_of_model(wrapped.model), wrapped.asked, str(wrapped.trained), digest_of(views), [view.name for view in views], how, versions()]
+    return hashlib.sha256(json.dumps(facts, sort_keys=True, default=str).encode()).hexdigest()[:DIGITS]
+
+
+def _finished(record: Path) -> list[str]:
+    """The names of the pictures that the same command finished before it was interrupted."""
+    try:
+        return [str(name) for name in json.loads(settled(record).read_text(encoding="utf-8"))["finished"]]
+    except (OSError, ValueError):  # none, or cut off by a crash of the machine
+        return []
+
+
+@contextmanager
+def _kept(record: Path, finished: Sequence[str]) -> Iterator[None]:
+    """Inside, Ctrl-C says how many pictures are finished, and how to go on; after it all are there, and the record is of no use."""
+    try:
+        yield
+    except KeyboardInterrupt as interrupt:
+        raise KeyboardInterrupt(f"interrupted with {plural(len(finished), 'picture')} finished; run the same command again to go on") from interrupt
+    record.unlink(missing_ok=True)
+
+
 def _refuse(wrapped: Wrapped, pictures: Sequence[Path], outputs: Sequence[str], overwrite: bool) -> None:
     """Raise the errors that writing the pictures and the other outputs would raise."""
     from mipmap_plugin.models.outputs import parts_of
@@ -163,15 +205,20 @@ def _refuse(wrapped: Wrapped, pictures: Sequence[Path], outputs: Sequence[str], 
     for picture in pictures:
         for path in (picture, *(_beside(picture, name) for name in outputs)):
             refuse_output(path, overwrite, parts, is_file=True)
-    refuse_unwritable(pictures[0])
+    for picture in pictures[:1]:
+        refuse_unwritable(picture)
 
 
-def _write(picture: Path, rendered: Rendered, outputs: Sequence[str], overwrite: bool) -> None:
+def _write(picture: Path, rendered: Rendered, outputs: Sequence[str], overwrite: bool, record: Path, finished: list[str]) -> None:
+    """Write a picture and its other outputs, and that it is finished: all of it or nothing."""
     from mipmap_plugin.formats.images import write_array, write_image
 
-    write_image(picture, rendered.image, overwrite=overwrite)
-    for name in outputs:
-        write_array(_beside(picture, name), getattr(rendered, name), overwrite=overwrite)
+    with together(record):
+        write_image(picture, rendered.image, overwrite=overwrite)
+        for name in outputs:
+            write_array(_beside(picture, name), getattr(rendered, name), overwrite=overwrite)
+        write_json(record, {"finished": [*finished, picture.name]}, overwrite=True)
+    finished.append(picture.name)
 
 
 def _beside(picture: Path, name: str) -> Path:

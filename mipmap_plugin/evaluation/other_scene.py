@@ -3,48 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from statistics import fmean
 
-import torch
-
+from mipmap_plugin.adaptation.target.other_world import doubt_about
 from mipmap_plugin.adaptation.target.photographs import names_of
-from mipmap_plugin.adaptation.target.resize import resize
-from mipmap_plugin.camera import evenly
-from mipmap_plugin.evaluation.measure import resized_base, views_seen
-from mipmap_plugin.evaluation.metrics import psnr
-from mipmap_plugin.evaluation.protocols import Protocol, TruthView
+from mipmap_plugin.evaluation.protocols import Protocol, TestView, TruthView
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.scenes.cameras_json import photographs_folder, trained_size
 from mipmap_plugin.wrap import Wrapped
 
-# So many views are looked at; they tell as much as all do.
-MOST_VIEWS = 8
-
 # px: a size that was rounded in other ways is no other size.
 ROUNDING = 4
 
 
-@torch.no_grad()
 def of_another_scene(model: Wrapped, views: Sequence[TruthView], scale: float, protocol: Protocol) -> str:
-    """That the base shows photographs worse than the mean of the others does, in a sentence; "" if it shows them better.
-
-    A model of the scene wins by far, and one of another scene loses, whatever both look like. It needs photographs from different places.
-    """
-    views = _from_different_places(evenly(views, MOST_VIEWS))
-    if len(views) < 2:
-        return ""
-    size = views[0].camera.zoomed(scale).size
-    truths = [resize(view.truth(scale, protocol), size, "bilinear") for view in views]  # some are a pixel wider, or taken upright
-    total = torch.stack(truths).sum(0)
-    by_others = fmean(psnr((total - truth) / (len(truths) - 1), truth) for truth in truths)
-    shown = (resized_base(model.render(view.camera).image, size, shrink_by=protocol.shrink_by) for view in views)
-    by_base = fmean(psnr(image.to(truth), truth) for image, truth in zip(shown, truths, strict=True))
-    if by_base > by_others:
-        return ""
-    compared = f"the base has {by_base:.1f} dB against the photographs, and the mean of the other photographs {by_others:.1f}"
-    return f"{compared}: they may be of another scene, or their cameras in another frame; check --images"
+    """That the base does not show what the photographs do, in a sentence (`doubt_about`); "" if it does."""
+    truths = {view.camera: view for view in views}
+    masks = ", whose transparent parts count as background" if any(isinstance(view, TestView) and view.transparent for view in views) else ""
+    return doubt_about([*truths], lambda camera: truths[camera].truth(scale, protocol), model.render, model.background, f"--images{masks}")
 
 
 def of_another_size(model: Wrapped, scene: Scene) -> str:
@@ -66,12 +42,3 @@ def of_another_size(model: Wrapped, scene: Scene) -> str:
     said, found, expected = (f"{width} x {height} px" for width, height in ((there[0].width, there[0].height), own, trained))
     doubt = f"the base's cameras are of {said}, but a training on the photographs (of {found}) has pictures of {expected}"
     return f"{doubt}: if these are what it was trained on, x1 is another scale than is taken here; add --cameras {scene.source}"
-
-
-def _from_different_places(views: Sequence[TruthView]) -> list[TruthView]:
-    """The views without those whose pose another one had: a camera that stands still sees the mean of its photographs."""
-    found: list[TruthView] = []
-    for view in views:
-        if not views_seen([replace(view.camera, time=None)], [each.camera for each in found]):
-            found.append(view)
-    return found

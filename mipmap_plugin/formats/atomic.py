@@ -201,6 +201,12 @@ def no_file(path: Path) -> str:
     return "" if stat.S_ISREG(status.st_mode) else f"is {'a folder' if stat.S_ISDIR(status.st_mode) else kind_of_node(status)}, not a file"
 
 
+def refuse_named_pipe(path: Path) -> None:
+    """Raise OSError for a pipe with a name, which may block forever; one of the shell's, as in <(ls) and /dev/stdin, has its other end."""
+    if path.resolve().is_fifo():
+        raise OSError(errno.EINVAL, "a pipe with a name, whose other end nobody may open", str(path))
+
+
 def _stat(path: Path) -> os.stat_result | None:
     """The status of `path`, None if nothing is there. Raises OutputExists for a broken link, OSError."""
     try:

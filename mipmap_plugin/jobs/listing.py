@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from mipmap_plugin.errors import CheckpointError, SettingsError
+from mipmap_plugin.formats.atomic import refuse_named_pipe
 
 Item = TypeVar("Item")
 
@@ -15,6 +16,7 @@ Item = TypeVar("Item")
 def read_list(path: Path) -> list[Path]:
     """The checkpoints or patterns in a text file, one a line; what follows a # is a comment. Raises SettingsError."""
     try:
+        refuse_named_pipe(path)
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"

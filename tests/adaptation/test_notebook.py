@@ -3,6 +3,7 @@
 import ast
 import json
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -82,33 +83,31 @@ def test_the_curve_of_an_adapted_model_is_plotted(adapted):
 
 
 def test_a_plot_without_matplotlib_is_one_sentence(adapted, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(SettingsError, match=r"pip install 'mipmap-plugin\[plot\]'"):
         adapted.plot()
 
 
 def test_render_takes_the_scale_that_a_file_was_adapted_to(tmp_path, capsys):
     base = tiny.folder(tmp_path / "base", tiny.cameras(2))
-    words = []
-    assert main(["adapt", str(base), "--scale", "1/4", "--recipe", "instant", *words]) == 0
+    assert main(["adapt", str(base), "--scale", "1/4", "--recipe", "instant"]) == 0
     for name, options, size in [("own", [], (8, 6)), ("asked", ["--scale", "1/2"], (16, 12))]:
-        assert main(["render", str(tmp_path / "base_x0.25"), "--output", str(tmp_path / name), *options, *words]) == 0
+        assert main(["render", str(tmp_path / "base_x0.25"), "--output", str(tmp_path / name), *options]) == 0
         assert {image_size(path) for path in (tmp_path / name).iterdir()} == {size}
     own, asked = capsys.readouterr().out.splitlines()[-2:]
     assert own == f"2 pictures in {tmp_path / 'own'}, at x0.25, which the file was adapted for"
     assert asked == f"2 pictures in {tmp_path / 'asked'}"
-    assert main(["render", str(base), "--output", str(tmp_path / "base_pictures"), *words]) == 0
+    assert main(["render", str(base), "--output", str(tmp_path / "base_pictures")]) == 0
     assert {image_size(path) for path in (tmp_path / "base_pictures").iterdir()} == {(32, 24)}
 
 
 def test_render_takes_the_viewer_that_a_file_was_adapted_for(tmp_path, capsys):
-    base, words = tiny.folder(tmp_path / "base", tiny.cameras(1)), []
-    drawn = {}
+    base, drawn = tiny.folder(tmp_path / "base", tiny.cameras(1)), {}
     for viewer in ("spark", "portable"):
         made = tmp_path / f"base_x0.25_{viewer}"
-        assert main(["adapt", str(base), "--scale", "1/4", "--recipe", "instant", "--viewer", viewer, *words]) == 0
+        assert main(["adapt", str(base), "--scale", "1/4", "--recipe", "instant", "--viewer", viewer]) == 0
         for name, options in {"own": [], "spark": ["--viewer", "spark"], "mip": ["--screen-filter", "mip"]}.items():
-            assert main(["render", str(made), "--output", str(tmp_path / viewer / name), *options, *words]) == 0
+            assert main(["render", str(made), "--output", str(tmp_path / viewer / name), *options]) == 0
             [picture] = (tmp_path / viewer / name).iterdir()
             drawn[viewer, name] = picture.read_bytes()
             told = capsys.readouterr().out.splitlines()[-1].partition(f"{tmp_path / viewer / name}, ")[2]

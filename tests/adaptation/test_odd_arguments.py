@@ -1,6 +1,7 @@
 """Records and methods of the API given tensors, arrays and numbers of the wrong kind: one error of ours, in place of torch's or Python's."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,6 @@ import torch
 
 from mipmap_plugin import Camera, Effects, Gaussians, load_model, wrap_model
 from mipmap_plugin.errors import SettingsError, ShapeError
-from mipmap_plugin.render_settings import RenderSettings
 
 VIEW = {"width": 8, "height": 6, "fx": 5.0, "fy": 5.0, "cx": 4.0, "cy": 3.0, "viewmat": torch.eye(4)}
 
@@ -17,17 +17,12 @@ VIEW = {"width": 8, "height": 6, "fx": 5.0, "fy": 5.0, "cx": 4.0, "cy": 3.0, "vi
 @pytest.mark.parametrize(("name", "value"), [
     ("sh_degree", "x"), ("sh_degree", 1.5), ("sh_degree", -1), ("screen_filter", 3), ("eps2d", "0.3"), ("eps2d", math.nan), ("eps2d", torch.ones(2)),
     ("background", 1), ("background", (0, 0, math.nan)), ("background", "abc"), ("supersampling", 2.0), ("supersampling", None),
-    ("near_plane", "x"), ("settings", None), ("outputs", 3), ("outputs", "depth"), ("exposure", []),
+    ("near_plane", "x"), ("near_plane", -1.0), ("near_plane", math.nan), ("near_plane", math.inf),
+    ("settings", None), ("outputs", 3), ("outputs", "depth"), ("exposure", []),
 ])  # fmt: skip
 def test_effects_of_the_wrong_kind_are_named(name, value):
     with pytest.raises(SettingsError, match=name):
         Effects(**{name: value})
-
-
-@pytest.mark.parametrize("name", ["radial", "bucketed", "fades", "fits_picture"])
-def test_switches_of_render_settings_are_true_or_false(name):
-    with pytest.raises(SettingsError, match=f"render settings: {name} must be True or False, got 'yes'"):
-        RenderSettings(**{name: "yes"})
 
 
 def test_a_sparse_pose_is_one():
@@ -57,6 +52,24 @@ def test_what_is_no_number_of_a_camera_is_named(name, value):
 def test_splats_of_other_kinds_of_tensors_are_named(change, sentence):
     with pytest.raises(ShapeError, match=sentence):
         Gaussians(**{name: change(tensor) for name, tensor in tiny.gaussians(3).tensors().items()})
+
+
+@pytest.mark.parametrize(("call", "error", "sentence"), [
+    (lambda splats: splats.to("nowhere"), SettingsError, "splats cannot be moved .device='nowhere', dtype=None.: Expected one of cpu"),
+    (lambda splats: splats.to(torch.float64), SettingsError, "splats cannot be moved .device=torch.float64"),
+    (lambda splats: splats.to(dtype=torch.int32), ShapeError, "means: expected floating-point numbers"),
+    (lambda splats: splats[0], ShapeError, "splats are chosen by a mask, a list of indices or a slice, got an int"),
+    (lambda splats: splats["means"], ShapeError, "got a str"),
+    (lambda splats: splats[torch.tensor([[0, 1]])], ShapeError, "got a Tensor"),
+    (lambda splats: splats.joined(3), ShapeError, r"only splats of one kind can be joined \(SH degree 1, float32 on cpu\), got 3"),
+    (lambda splats: splats.joined(splats.to(dtype=torch.float64)), ShapeError, "float64 on cpu"),
+    (lambda splats: splats.joined(splats.to("meta")), ShapeError, "float32 on meta"),
+    (lambda splats: splats.joined(replace(splats, sh=splats.sh[:, :1])), ShapeError, "SH degree 0"),
+    (lambda splats: splats.joined(replace(splats, covariances=torch.eye(3).expand(3, 3, 3))), ShapeError, "with covariances"),
+])  # fmt: skip
+def test_what_cannot_be_done_with_splats_is_one_sentence(call, error, sentence):
+    with pytest.raises(error, match=sentence):
+        call(tiny.gaussians(3))
 
 
 @pytest.mark.parametrize(("call", "sentence"), [

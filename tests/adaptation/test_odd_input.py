@@ -125,3 +125,9 @@ def test_outputs_may_be_none(adapted):
 
 def test_a_ladder_is_a_line_in_a_notebook():
     assert repr(Ladder(SimpleNamespace(levels=[1, 2]), None, None)) == "<Ladder: 2 levels>"
+
+
+@pytest.mark.parametrize("cameras", [[], ()])
+def test_an_empty_list_of_cameras_is_no_wish_for_an_orbit(cameras):
+    with pytest.raises(SettingsError, match="cameras: there are none"):
+        wrap_model(tiny.model(), cameras=tiny.cameras(2)).adapt(0.5, cameras=cameras)

@@ -25,11 +25,6 @@ def test_a_time_budget_begins_as_crisp_as_without():
     assert recipe("default", 2, time_budget_s=3.0).crispness == recipe("default", 2).crispness
 
 
-def test_an_unknown_recipe_is_told_the_known_ones():
-    with pytest.raises(SettingsError, match="there is no recipe 'best'; choose from default, instant, paper, thorough"):
-        recipe("best", 2)
-
-
 def test_what_is_no_recipe_is_named():
     register_recipe("mine", 3)
     with pytest.raises(PluginError, match="recipe 'mine' is of type int"):
@@ -62,6 +57,27 @@ def test_each_wrong_setting_is_told_with_what_it_may_be_and_what_was_got(setting
     with pytest.raises(SettingsError) as refused:
         recipe("default", 1 / 4, **settings)
     assert str(refused.value) == said
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: AdaptConfig(steps=-1), "setting steps: must be a whole number of at least 0, got -1"),
+        (lambda: AdaptConfig(stps=1), "there is no setting stps; did you mean steps? mipmap_plugin.config has all of them"),
+        (lambda: AdaptConfig(rates={"mean": 1}), "there is no setting rates.mean; did you mean means? mipmap_plugin.config has all of them"),
+        (lambda: LearningRates(means=-1), "setting rates.means: must be a number of at least 0, got -1"),
+    ],
+)
+def test_settings_that_are_made_in_python_are_told_of_alike(make, said):
+    with pytest.raises(SettingsError) as refused:
+        make()
+    assert str(refused.value) == said
+
+
+def test_a_recipe_that_is_wrong_itself_is_named():
+    register_recipe("mine", lambda scale, network: dict(steps=-1))
+    with pytest.raises(SettingsError, match=r"^recipe mine: setting steps: must be a whole number of at least 0, got -1$"):
+        recipe("mine", 2, seed=1)
 
 
 def test_what_any_setting_may_be_has_words():

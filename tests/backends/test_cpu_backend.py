@@ -23,7 +23,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.splatting.viewers import BUILT_IN
 
-needs_numba = pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="numba, the extra `cpu`, is not installed")
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="numba, the extra `cpu`, is not installed")
 BACKEND = CpuBackend()
 
 # Three tiles across with the last one cut, and three down; off center, fx != fy.
@@ -67,7 +67,6 @@ def assert_gradients_close(actual, expected, relative=2e-5):
         assert (actual[name] - grad).norm() <= relative * grad.norm(), name
 
 
-@needs_numba
 @pytest.mark.parametrize("screen_filter", ["classic", "antialiased", "mip", "analytic", "window"])
 @pytest.mark.parametrize("view", [camera(), WIDE], ids=["one-tile", "many-tiles"])
 def test_equals_a_sum_over_every_pixel(view, screen_filter):
@@ -81,7 +80,6 @@ def test_equals_a_sum_over_every_pixel(view, screen_filter):
     assert_gradients_close(grads, gradients(expected_image, expected_alpha, g))
 
 
-@needs_numba
 def test_pixels_stop_at_the_least_transmittance():
     g = gaussians(300, dtype=torch.float32)
     g = leaf(replace(g, opacities=0.9 + 0.1 * g.opacities, scales=3 * g.scales).to(dtype=torch.float64))
@@ -92,7 +90,6 @@ def test_pixels_stop_at_the_least_transmittance():
     assert_gradients_close(grads, gradients(expected_image, expected_alpha, g), 1e-4)
 
 
-@needs_numba
 @pytest.mark.parametrize(("count", "opacity", "settings"), [
     (3, 1.0, RenderSettings(max_alpha=1.0, min_transmittance=0.0)),
     (20, 1.0, RenderSettings(max_alpha=0.999, min_transmittance=0.0)),
@@ -115,7 +112,6 @@ def test_gradients_of_splats_that_let_nothing_through_are_right(count, opacity, 
         torch.testing.assert_close(grads[0][name], grads[1][name], atol=1e-5 * float(grads[1][name].abs().max()), rtol=1e-3)
 
 
-@needs_numba
 @pytest.mark.parametrize("degree", [2, 3, 4])
 def test_every_harmonic_has_its_gradient(degree):
     g = leaf(gaussians(30, degree, dtype=torch.float32).to(dtype=torch.float64))
@@ -125,13 +121,11 @@ def test_every_harmonic_has_its_gradient(degree):
     assert_gradients_close(grads, gradients(reference.image, reference.alpha, g))
 
 
-@needs_numba
 def test_bands_left_out_have_no_gradient():
     grads = draw(gaussians(30, 3), camera(), Effects(1))[2]
     assert grads["sh"][:, :4].any() and not grads["sh"][:, 4:].any()
 
 
-@needs_numba
 def test_covariances_need_not_be_symmetric_to_have_their_gradient():
     g = gaussians(40, dtype=torch.float32).to(dtype=torch.float64)
     factor = torch.randn(40, 3, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * g.scales[:, None]
@@ -143,7 +137,6 @@ def test_covariances_need_not_be_symmetric_to_have_their_gradient():
     assert_gradients_close(grads, {name: grad for name, grad in expected.items() if name in grads})
 
 
-@needs_numba
 @pytest.mark.parametrize("screen_filter", ["analytic", "window"])
 def test_splats_that_are_integrated_are_blended_in_linear_light_too(screen_filter):
     splats, effects = gaussians(20).to(dtype=torch.float32), Effects(1, screen_filter, settings=RenderSettings(linear_light=2.2))
@@ -158,7 +151,6 @@ def test_splats_that_are_integrated_are_drawn_with_the_usual_cut_offs_only(cut_o
     assert BACKEND.lacking(needs) == ["it draws the screen filter window with the usual cut-offs only"]
 
 
-@needs_numba
 @pytest.mark.parametrize("screen_filter", ["classic", "antialiased", "mip", "analytic", "window"])
 def test_the_number_of_threads_changes_no_bit(screen_filter, threads_for_any_work):
     g = gaussians(2000)
@@ -182,7 +174,6 @@ print(*(hashlib.sha256(part.numpy().tobytes()).hexdigest() for part in (image, a
 """
 
 
-@needs_numba
 @pytest.mark.slow
 def test_how_many_numbers_a_register_holds_changes_no_bit(tmp_path):
     """Processors with AVX-512 compute the geometry of 8 splats at a time, others that of 4; either can be compiled anywhere."""
@@ -200,7 +191,6 @@ SHOTS = [
 ]  # fmt: skip
 
 
-@needs_numba
 def test_views_of_any_effects_drawn_in_one_call_are_those_drawn_alone(threads_for_any_work):
     g = gaussians(2000, dtype=torch.float32)
     alone, together = leaf(g), []
@@ -219,7 +209,6 @@ def test_views_of_any_effects_drawn_in_one_call_are_those_drawn_alone(threads_fo
         torch.testing.assert_close(first, getattr(alone, name).grad, atol=1e-5 * float(first.abs().max()), rtol=1e-4)
 
 
-@needs_numba
 def test_packed_views_are_packed_for_each_camera():
     packed = next(viewer for viewer in BUILT_IN if viewer.settings.packing).effects(Effects(1))
     g, shots = gaussians(300, dtype=torch.float32), [(each, packed) for each, _ in SHOTS[:2]]
@@ -227,7 +216,6 @@ def test_packed_views_are_packed_for_each_camera():
     assert all(torch.equal(rendered.image, BACKEND.render(g, *shot).image) for rendered, shot in zip(drawn, shots, strict=True))
 
 
-@needs_numba
 @pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "sh"])
 def test_a_row_with_nan_changes_no_other_row(field):
     g = gaussians(50, dtype=torch.float32)
@@ -241,7 +229,6 @@ def test_a_row_with_nan_changes_no_other_row(field):
         assert torch.equal(grad[rest], expected_grads[name]) and not grad[20].any()
 
 
-@needs_numba
 @pytest.mark.parametrize("size", [1e4, 1e8, 1e20, 1e38])
 def test_splats_whose_size_overflows_an_integer_are_finite(size):
     g = gaussians(20, dtype=torch.float32)
@@ -252,7 +239,6 @@ def test_splats_whose_size_overflows_an_integer_are_finite(size):
     assert all(torch.isfinite(grad).all() for grad in grads.values())
 
 
-@needs_numba
 def test_an_input_changed_before_the_backward_pass_is_noticed():
     g = leaf(gaussians(20, dtype=torch.float32))
     rendered = BACKEND.render(g, camera(), Effects(1))
@@ -262,7 +248,6 @@ def test_an_input_changed_before_the_backward_pass_is_noticed():
         rendered.image.sum().backward()
 
 
-@needs_numba
 def test_only_tensors_that_require_gradients_get_them():
     g = gaussians(20, dtype=torch.float32)
     g = replace(g, means=g.means.requires_grad_())
@@ -274,7 +259,6 @@ def test_only_tensors_that_require_gradients_get_them():
     assert torch.equal(g.means.grad, expected)
 
 
-@needs_numba
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
 def test_a_forked_process_draws_with_threads_of_its_own(threads_for_any_work):
     torch.set_num_threads(2)
@@ -286,7 +270,6 @@ def test_a_forked_process_draws_with_threads_of_its_own(threads_for_any_work):
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
-@needs_numba
 def test_torch_still_works_after_its_idle_threads_were_dismissed(threads_for_any_work):
     torch.set_num_threads(2)
     values = torch.rand(100_000)

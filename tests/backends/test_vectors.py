@@ -62,5 +62,4 @@ def test_t6_fainter_splats_are_not_drawn(difference, drawn):
 
 
 def _with_opacity(opacity) -> Gaussians:
-    splat = t3_gaussian()
-    return Gaussians(splat.means, splat.quats, splat.scales, torch.full_like(splat.opacities, float(opacity)), splat.sh)
+    return replace(t3_gaussian(), opacities=torch.tensor([float(opacity)], dtype=torch.float64))

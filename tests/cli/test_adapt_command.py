@@ -6,6 +6,7 @@ import re
 import signal
 import weakref
 from pathlib import Path
+from unittest.mock import Mock
 
 import pressing
 import pytest
@@ -104,7 +105,7 @@ def test_an_output_that_exists_needs_overwrite_and_is_refused_before_any_work(ru
     base = tiny.ply(tmp_path / "base.ply")
     (tmp_path / "base_x4.ply").write_text("precious")
     with monkeypatch.context() as first:
-        first.setattr("mipmap_plugin.wrap.Wrapped.adapt", lambda *_, **__: pytest.fail("worked in vain"))
+        first.setattr(Wrapped, "adapt", lambda *_, **__: pytest.fail("worked in vain"))
         refused(run("adapt", base, "--scale", "2", "--scale", "4"), "base_x4.ply exists already; pass --overwrite")
     assert (tmp_path / "base_x4.ply").read_text() == "precious" and not (tmp_path / "base_x2.ply").exists()
     assert run("adapt", base, "--scale", "4", "--overwrite", *NO_STEP)[0] == 0
@@ -167,10 +168,7 @@ def test_a_page_goes_with_the_file_that_it_shows(run, model_folder, tmp_path):
 
 @pytest.mark.parametrize("error", [OutputError("the disk is full"), KeyboardInterrupt()])
 def test_a_file_is_kept_whose_page_fails(run, model_folder, tmp_path, monkeypatch, error):
-    def fail(*_):
-        raise error
-
-    monkeypatch.setattr("mipmap_plugin.pages.html.write_page", fail)
+    monkeypatch.setattr("mipmap_plugin.pages.html.write_page", Mock(side_effect=error))
     code, _, told = run("adapt", model_folder, "--scale", "1/2", "--output", tmp_path / "a.ply", "--recipe", "instant", "--report")
     assert code == (130 if isinstance(error, KeyboardInterrupt) else 2) and (str(error) or "interrupted") in told
     assert (tmp_path / "a.ply").exists() and not (tmp_path / "a.ply.report.html").exists()

@@ -35,6 +35,15 @@ def test_evaluate_prints_a_table_and_writes_its_rows(run, model_folder, tmp_path
     refused(run(*words), "rows.json exists already; pass --overwrite")
 
 
+def test_a_page_does_not_outlive_its_rows(run, model_folder, tmp_path):
+    words = ["evaluate", model_folder, "--images", tiny.scene(tmp_path / "scene"), "--output", tmp_path / "rows.json", "--scale", "1"]
+    assert run(*words)[0] == 0 and (tmp_path / "rows.html").exists()
+    assert run(*words, "--overwrite")[0] == 0 and (tmp_path / "rows.html").exists()
+    assert run(*words, "--overwrite", "--no-report")[0] == 0 and not (tmp_path / "rows.html").exists()
+    (tmp_path / "rows.html").write_text("<title>mine</title>")
+    assert run(*words, "--overwrite", "--no-report")[0] == 0 and (tmp_path / "rows.html").exists()
+
+
 def test_evaluate_says_where_a_file_is_adapted_to_images_of_another_filter_than_the_truths(run, model_folder, tmp_path):
     scene = tiny.scene(tmp_path / "scene")
     words = ["evaluate", model_folder, "--images", scene, "--scale", "1/2", "--recipe", "default", "--recipe", "instant", "--steps", "1"]
@@ -45,11 +54,6 @@ def test_evaluate_says_where_a_file_is_adapted_to_images_of_another_filter_than_
         assert code == 0, err
         notes.append(json.loads(out)["notes"])
     assert [len(each) for each in notes] == [1, 0, 0] and notes[0][0].startswith(told)
-
-
-def test_evaluate_as_json(run, model_folder, tmp_path):
-    code, out, _ = run("evaluate", model_folder, "--images", tiny.scene(tmp_path / "scene"), "--scale", "1", "--json")
-    assert code == 0 and json.loads(out)["rows"][0]["name"] == "base"
 
 
 def test_evaluate_says_which_rows_are_missing_and_that_no_row_is_exposed(run, model_folder, tmp_path, monkeypatch):

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import tiny
@@ -109,11 +110,7 @@ def test_requests_that_cannot_be_served_end_in_one_sentence(run, model_folder):
 def test_a_full_disk_ends_in_one_sentence_and_leaves_the_old_file(run, tmp_path, monkeypatch):
     base, output = tiny.ply(tmp_path / "base.ply"), tmp_path / "new.ply"
     output.write_text("precious")
-
-    def full(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("mipmap_plugin.formats.atomic.os.replace", full)
+    monkeypatch.setattr("mipmap_plugin.formats.atomic.os.replace", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
     words = ["--output", output, "--overwrite", *NO_STEP]
     code, out, err = run("adapt", base, "--scale", "4", *words)
     orbit, said = err.splitlines()
@@ -129,11 +126,6 @@ def test_levels_without_cameras_are_told_of_once(run, tmp_path):
     code, _, err = run("levels", base, *words, "--output", tmp_path / "levels")
     assert code == 0 and err.count("views of a generated orbit are adapted to") == 1
     assert err.count("would change levels at the distances of a generated orbit") == 1
-
-
-def test_an_output_below_a_file_ends_in_one_sentence(run, tmp_path):
-    base = tiny.ply(tmp_path / "base.ply")
-    refused(run("adapt", base, "--scale", "4", "--output", base / "new.ply", *NO_STEP), "new.ply")
 
 
 @pytest.mark.parametrize("words", ["", "fly", "adapt", "adapt a.ply --scale 0", "adapt a.ply --scale 1/0", "inspect a --what"])

@@ -15,7 +15,7 @@ from mipmap_plugin.evaluation.measure import baselines
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import write_cameras
-from mipmap_plugin.wrap import wrap_model
+from mipmap_plugin.wrap import Wrapped, wrap_model
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
@@ -90,6 +90,31 @@ def test_render_refuses_names_that_are_not_there_and_pictures_that_are(run, mode
     refused(run(*words), "train_view_1.png exists already; pass --overwrite")
     refused(run(*words, "--overwrite", "--supersampling", "0"), "supersampling must be a whole number of at least 1")
     assert run(*words, "--overwrite")[0] == 0
+
+
+@pytest.mark.parametrize("more", [(), ("--overwrite",)])
+def test_render_goes_on_with_the_pictures_that_are_missing(run, model_folder, tmp_path, monkeypatch, more):
+    words = ["render", model_folder, "--output", tmp_path / "out", "--depth", *more]
+    if more:
+        assert run(*words, "--scale", "1/2")[0] == 0
+    drawn, draw = [], Wrapped.render
+
+    def tired(self, camera, *args, **options):
+        drawn.append(camera.name)
+        if len(drawn) == 3:
+            raise KeyboardInterrupt
+        return draw(self, camera, *args, **options)
+
+    monkeypatch.setattr(Wrapped, "render", tired)
+    code, _, err = run(*words)
+    assert code == 130 and "interrupted with 2 pictures finished; run the same command again to go on" in err
+    if not more:
+        assert "exists already; pass --overwrite" in refused(run(*words, "--scale", "1/2"))  # another request is no going on
+    drawn += ["so that none is the third"]
+    code, out, _ = run(*words)
+    assert code == 0 and out.startswith("4 pictures in") and len(drawn) == 3 + 1 + 2
+    assert sorted(file.suffix for file in (tmp_path / "out").iterdir()) == [".npy"] * 4 + [".png"] * 4
+    assert Image.open(tmp_path / "out" / "train_view_1.png").size == (32, 24)
 
 
 def test_picture_names_are_unique_and_stay_in_their_folder():

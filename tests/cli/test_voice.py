@@ -114,6 +114,12 @@ def test_a_log_that_cannot_be_written_is_one_sentence(tmp_path, capsys):
     assert said.out == "" and said.err.count("\n") == 1 and "cannot be written" in said.err and "give --log another file" in said.err
 
 
+def test_a_log_is_no_pipe_that_nobody_may_open(tmp_path, capsys):
+    os.mkfifo(tmp_path / "log")
+    assert main(["list", "recipes", "--log", str(tmp_path / "log")]) == 2
+    assert "log cannot be written (a pipe with a name, whose other end nobody may open); give --log another file" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("words", [["backends", "--log"], ["backends", "--log", "--json"], ["backends", "--log="]])
 def test_a_log_needs_a_file(words):
     with pytest.raises(SettingsError, match="--log needs a file"):

@@ -1,7 +1,6 @@
 """Effects are data: derived from model, camera and request, each with a reason and a cost."""
 
 import json
-import math
 from dataclasses import replace
 
 import anchor_checkpoints
@@ -88,12 +87,6 @@ def test_everything_on():
     assert reasons["upsampler"] == "bicubic enlarges the base's image to the truth"
     assert reasons["densification statistics"] == "splats with gradients above 0.0002 are cloned or split"
     assert not states(Effects(eps2d=0.0), splats)["screen filter"][0]
-
-
-@pytest.mark.parametrize("near_plane", [-1.0, math.nan, math.inf])
-def test_a_near_plane_behind_the_eye_is_refused(near_plane):
-    with pytest.raises(SettingsError, match="near_plane must be a number of at least 0, got"):
-        Effects(near_plane=near_plane)
 
 
 def test_without_dilation_nothing_is_compensated():

@@ -21,10 +21,7 @@ from mipmap_plugin.wrap import Wrapped, wrap_model
 pytestmark = pytest.mark.usefixtures("few_views")
 
 BRIEF = dict(steps=2, extra_views=1, check_every=1)
-
-
-def noise(*shape, seed=0):
-    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
+BLACK = (0.0, 0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +45,7 @@ def evaluate(model, scene, scales, recipes, protocol, perceptual=None, **setting
 def test_test_views_are_brought_to_the_density_of_the_base(scene):
     base = tiny.cameras()[0]
     for scale in (1, 1 / 2):
-        views = protocols.test_views(scene, [base.zoomed(scale)], (0.0, 0.0, 0.0))
+        views = protocols.test_views(scene, [base.zoomed(scale)], BLACK)
         assert [view.camera.name for view in views] == ["view_0", "view_1"]
         assert all(view.camera.split == "test" and view.camera.size == (24 * scale, 32 * scale) for view in views)
         assert all(view.photograph.shape == (24, 32, 3) for view in views)
@@ -56,7 +53,7 @@ def test_test_views_are_brought_to_the_density_of_the_base(scene):
 
 def test_photographs_are_kept_in_bytes(scene):
     camera = next(iter(scene.images))
-    read = scene.image(camera, (0.0, 0.0, 0.0))
+    read = scene.image(camera, BLACK)
     kept = photographs.packed(read)
     assert kept.dtype == torch.uint8 and torch.equal(photographs.unpacked(kept), read)
     every_level = (torch.arange(256).float() / 255).expand(2, 256)[..., None].expand(-1, -1, 3)
@@ -64,7 +61,7 @@ def test_photographs_are_kept_in_bytes(scene):
 
 
 def test_a_photograph_that_bytes_cannot_hold_keeps_its_bits():
-    image = noise(24, 32, 3)
+    image = torch.full((24, 32, 3), 76.5 / 255)
     assert photographs.packed(image) is image and photographs.unpacked(image) is image
 
 
@@ -72,26 +69,26 @@ def test_beyond_the_limit_photographs_are_read_again(scene, monkeypatch):
     reads, image = [], type(scene).image
     monkeypatch.setattr(type(scene), "image", lambda self, camera, background: reads.append(camera) or image(self, camera, background))
     first, second = [*scene.images][:2]
-    of_first, of_second = photographs.kept_photographs(scene, (first, second), (0.0, 0.0, 0.0), most_bytes=24 * 32 * 3)
-    assert torch.equal(of_first(), image(scene, first, (0.0, 0.0, 0.0))) and torch.equal(of_second(), image(scene, second, (0.0, 0.0, 0.0)))
+    of_first, of_second = photographs.kept_photographs(scene, (first, second), BLACK, most_bytes=24 * 32 * 3)
+    assert torch.equal(of_first(), image(scene, first, BLACK)) and torch.equal(of_second(), image(scene, second, BLACK))
     assert reads == [first, second, second]
 
 
 def test_all_photographs_are_judged_by_where_none_is_a_test_view(scene):
     only_train = replace(scene, cameras=tuple(scene.split("train")))
-    assert len(protocols.test_views(only_train, tiny.cameras(), (0.0, 0.0, 0.0))) == 3
+    assert len(protocols.test_views(only_train, tiny.cameras(), BLACK)) == 3
 
 
 def test_a_scene_without_photographs_is_refused(scene):
     with pytest.raises(SettingsError, match="there are no photographs to compare with"):
-        protocols.test_views(replace(scene, images={}), tiny.cameras(), (0.0, 0.0, 0.0))
+        protocols.test_views(replace(scene, images={}), tiny.cameras(), BLACK)
 
 
 # Rows
 
 
 def test_a_row_is_the_mean_over_the_views_of_each_views_decibel(scene):
-    views = protocols.test_views(scene, tiny.cameras(), (0.0, 0.0, 0.0))
+    views = protocols.test_views(scene, tiny.cameras(), BLACK)
     row = Evaluator(views, PROTOCOLS["P3"]).row("black", 1, lambda camera: torch.zeros(*camera.size, 3), gaussians=7)
     assert row.psnr_db == pytest.approx(sum(psnr(torch.zeros(24, 32, 3), view.photograph) for view in views) / 2)
     assert (row.name, row.scale, row.gaussians, row.adapt_seconds, row.adapted_on) == ("black", 1, 7, 0.0, "-")
@@ -99,7 +96,7 @@ def test_a_row_is_the_mean_over_the_views_of_each_views_decibel(scene):
 
 
 def test_the_base_against_photographs_of_itself_is_perfect(model, scene):
-    views = protocols.test_views(scene, tiny.cameras(), (0.0, 0.0, 0.0))
+    views = protocols.test_views(scene, tiny.cameras(), BLACK)
     [row] = training_free_rows(model, Evaluator(views, PROTOCOLS["P3"]), 1)
     assert row.name == "base" and row.psnr_db > 50 and row.ssim == pytest.approx(1.0, abs=1e-3)
 

@@ -6,13 +6,15 @@ from types import SimpleNamespace
 import pytest
 import tiny
 import torch
+from PIL import Image
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.cli import main
 from mipmap_plugin.evaluation.other_scene import of_another_scene, of_another_size
-from mipmap_plugin.evaluation.protocols import PROTOCOLS
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, photographed_views
 from mipmap_plugin.evaluation.tradeoff.truth import photographs
 from mipmap_plugin.formats.images import write_image
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import Scene, load_scene
 
 pytestmark = pytest.mark.usefixtures("few_views")
@@ -73,6 +75,53 @@ def test_photographs_of_several_sizes_are_compared(base):
     cameras = tiny.cameras(4)
     square = [camera.window(24, 24) if number % 2 else camera for number, camera in enumerate(cameras)]
     assert not doubt(base, seen(base, square)) and {camera.size for camera in square} == {(24, 32), (24, 24)}
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+def test_a_world_that_is_turned_by_half_a_turn_is_told_of(base, axis):
+    """LichtFeld Studio turns that of a transforms file about y."""
+    turn = torch.diag(torch.tensor([*(1.0 if each == axis else -1.0 for each in "xyz"), 1.0], dtype=torch.float64))
+    views = seen(base, tiny.cameras(6))
+    turned = [SimpleNamespace(camera=view.camera.moved(turn), truth=view.truth) for view in views]
+    angles = {"x": "180,0,0", "y": "0,180,0", "z": "0,0,180"}[axis]
+    assert f"turned by half a turn about {axis}" in doubt(base, turned) and f"(splat-transform -r {angles})" in doubt(base, turned)
+
+
+def test_transparent_photographs_that_do_not_fit_are_told_to_count_as_background(tmp_path, base):
+    folder = tiny.scene(tmp_path / "scene", tiny.cameras(4, split="test"), seed=5)
+    for image in folder.glob("test/*.png"):
+        Image.open(image).convert("RGBA").save(image)
+    views = photographed_views(base, base.place(load_scene(folder)))
+    assert doubt(base, views).endswith("check --images, whose transparent parts count as background")
+
+
+def test_what_a_base_leaves_empty_does_not_count():
+    """Of a capture that was cut down to one object, photographs show much else."""
+    whole, cameras = tiny.model(), tiny.cameras(6)
+    left = whole.parameters()["means"].norm(dim=1) < 0.6
+    assert 10 < left.sum() < 40
+    cut = wrap_model(VanillaModel.from_gaussians(tiny.gaussians()[left], whole.trained), cameras=cameras)
+    assert not doubt(cut, seen(wrap_model(whole, cameras=cameras), cameras))
+
+
+def test_cameras_of_a_capture_that_does_not_show_the_splats_are_warned_of(tmp_path, recwarn):
+    scene = tiny.scene(tmp_path / "scene", tiny.cameras(4))
+    for seed in (0, 5):
+        wrap_model(tiny.ply(tmp_path / f"{seed}.ply", seed=seed), cameras=scene)
+        assert any("check --cameras" in str(warning.message) for warning in recwarn) == (seed == 5)
+
+
+def test_a_damaged_photograph_does_not_matter_to_cameras(tmp_path, recwarn):
+    scene = tiny.scene(tmp_path / "scene", tiny.cameras(4))
+    image = sorted(scene.glob("test/*.png"))[0]
+    image.write_bytes(image.read_bytes()[:-40])
+    assert len(wrap_model(tiny.ply(tmp_path / "base.ply"), cameras=scene).cameras) == 4 and not recwarn
+
+
+def test_photographs_that_a_zoom_in_is_adapted_to_are_warned_of(tmp_path, recwarn):
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(4))
+    base.adapt(2.0, images=tiny.scene(tmp_path / "scene", train=tiny.cameras(4), seed=5), steps=1)
+    assert any("check --images" in str(warning.message) for warning in recwarn)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import importlib.util
 import sys
 import urllib.error
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -89,10 +90,7 @@ def test_another_file_is_refused(tmp_path, random_weights):
 
 
 def test_what_lacks_is_named_with_its_remedy(monkeypatch):
-    def no_network(*_, **__):
-        raise urllib.error.URLError("no route")
-
-    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", no_network)
+    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", Mock(side_effect=urllib.error.URLError("no route")))
     with pytest.raises(SettingsError, match=r"cannot be downloaded .*no route.*; download https://.*vgg16.* and give the file \(--lpips-weights\)"):
         Perceptual("vgg")
     monkeypatch.setitem(sys.modules, "lpips", None)

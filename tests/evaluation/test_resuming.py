@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import tiny
@@ -147,29 +148,18 @@ def test_what_another_recipe_of_that_name_made_is_measured_again(folder, monkeyp
 def test_a_command_that_ends_between_its_two_files_is_not_in_its_own_way(folder, capsys, monkeypatch):
     words = ["evaluate", str(folder / "base"), "--images", str(folder / "scene"), "--scale", "1/2", "--output", str(folder / "rows.json")]
     with monkeypatch.context() as failing:
-        failing.setattr("mipmap_plugin.commands.evaluate.write_json", lambda *_: (_ for _ in ()).throw(OutputError("the disk is full")))
+        failing.setattr("mipmap_plugin.commands.evaluate.write_json", Mock(side_effect=OutputError("the disk is full")))
         assert main(words) == 2
     assert main(words) == 0, capsys.readouterr().err
     assert {path.name for path in folder.iterdir()} == {"base", "scene", "rows.json", "rows.html"}
 
 
-def test_the_scene_is_not_replaced_by_the_rows(folder, capsys):
-    before = (folder / "scene" / "transforms_test.json").read_bytes()
-    assert main([*evaluate(folder, "scene/transforms_test.json"), "--overwrite"]) == 2
-    assert "never replaced" in capsys.readouterr().err and (folder / "scene" / "transforms_test.json").read_bytes() == before
-
-
-def test_the_cameras_are_not_replaced_by_the_rows(folder, capsys):
-    before = (folder / "base" / "cameras.json").rename(folder / "cameras.json").read_bytes()
-    assert main([*evaluate(folder, "cameras.json"), "--cameras", str(folder / "cameras.json"), "--overwrite"]) == 2
-    assert "never replaced" in capsys.readouterr().err and (folder / "cameras.json").read_bytes() == before
-
-
-def test_a_photograph_is_not_replaced_by_the_rows(folder, capsys):
-    photograph = next((folder / "scene").rglob("*.png"))
-    before = photograph.read_bytes()
-    assert main([*evaluate(folder, photograph.relative_to(folder)), "--overwrite"]) == 2
-    assert "never replaced" in capsys.readouterr().err and photograph.read_bytes() == before
+@pytest.mark.parametrize("given", ["scene/transforms_test.json", "scene/test/view_0.png", "cameras.json"])
+def test_what_rows_are_measured_from_is_not_replaced_by_them(folder, capsys, given):
+    (folder / "base" / "cameras.json").rename(folder / "cameras.json")
+    before = (folder / given).read_bytes()
+    assert main([*evaluate(folder, given), "--cameras", str(folder / "cameras.json"), "--overwrite"]) == 2
+    assert "never replaced" in capsys.readouterr().err and (folder / given).read_bytes() == before
 
 
 def test_rows_and_page_are_two_files(folder, capsys):

@@ -3,14 +3,13 @@
 import gzip
 import hashlib
 import json
-import sys
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tiny
-from exchange_files import RECORD, SPZ, sentence, tool_request
+from exchange_files import RECORD, SPZ, answer_by, sentence, tool_request
 from ply_files import write, write_splats
 
 from mipmap_plugin.errors import CheckpointError, OutputError
@@ -147,12 +146,11 @@ def test_sog_as_a_file_and_as_a_folder(tmp_path, tool, where):
 def test_npx_is_tried_where_the_tool_is_not_on_the_path(tmp_path, tool):
     """Installed for one project only; nothing is downloaded."""
     (tool / "splat-transform").rename(tool / "real")
-    (tool / "npx").write_text(f"#!{sys.executable}\nimport os, sys\nassert sys.argv[1:3] == ['--no-install', 'splat-transform']\n"
-        f"sys.exit(0) if sys.argv[3:] == ['--version'] else os.execv('{tool / 'real'}', ['real', *sys.argv[3:]])\n")
-    (tool / "npx").chmod(0o755)
+    asked = "assert sys.argv[1:3] == ['--no-install', 'splat-transform']"
+    answer_by(tool, f"{asked}\nsys.exit(0) if sys.argv[3:] == ['--version'] else os.execv('{tool / 'real'}', ['real', *sys.argv[3:]])", "npx")
     (tmp_path / "a.spz").write_bytes(SPZ)
     assert len(load_model(tmp_path / "a.spz")) == 60
-    (tool / "npx").write_text(f"#!{sys.executable}\nimport sys\nsys.exit(1)\n")
+    answer_by(tool, "sys.exit(1)", "npx")
     assert "npm install" in sentence(tmp_path / "a.spz")
 
 
@@ -210,7 +208,7 @@ def test_streamed_sog_is_read_by_a_splat_transform_that_knows_it(tmp_path, tool)
     (tmp_path / "lod-meta.json").write_text(json.dumps({"lodLevels": 2, "filenames": ["0_0/meta.json", "1_0/meta.json"], "tree": {}}))
     assert len(load_model(tmp_path)) == 60
     assert tool_request(tool)[1] == str(tmp_path / "lod-meta.json")
-    (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\nprint('splat-transform v2.7.1 (b42b60c)', file=sys.stderr)\n")
+    answer_by(tool, "print('splat-transform v2.7.1 (b42b60c)', file=sys.stderr)")
     assert sentence(tmp_path).endswith(
         "lod-meta.json is Streamed SOG: splat-transform 2.7.1 is too old for it, and 3.2 or newer is needed, which needs Node.js 22; "
         "run: npm install -g @playcanvas/splat-transform@latest"
@@ -218,7 +216,6 @@ def test_streamed_sog_is_read_by_a_splat_transform_that_knows_it(tmp_path, tool)
 
 
 def test_an_error_of_node_is_told(tmp_path, tool):
-    script = "print('TypeError [ERR_PARSE_ARGS_UNKNOWN_OPTION]: Unknown option', file=sys.stderr)\nprint('failed in 0.006s')\nsys.exit(1)\n"
-    (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\n{script}")
+    answer_by(tool, "print('failed in 0.006s')\nsys.exit('TypeError [ERR_PARSE_ARGS_UNKNOWN_OPTION]: Unknown option')")
     with pytest.raises(OutputError, match=r"does not write it \(Unknown option\)"):
         tiny.model().save(tmp_path / "a.spz", provenance={})

@@ -1,16 +1,14 @@
 """What is written in an exchange format, for which viewers, and what it has no place for."""
 
 import gzip
-import json
-import re
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import tiny
 import torch
-from exchange_files import RECORD, SPZ, tool_request
+from exchange_files import RECORD, SPZ, answer_by, report_of, tool_request
+from pages_read import record_of
 from ply_files import write
 
 from mipmap_plugin.cli import main
@@ -33,7 +31,7 @@ def test_adapt_reads_and_writes_spz(tmp_path, tool, capsys):
     assert main(["adapt", str(tmp_path / "phone.spz"), "--scale", "1/4", "--recipe", "instant"]) == 0
     assert (tmp_path / "phone_x0.25.spz").read_bytes().startswith(b"ply")  # the stand-in's
     assert tool_request(tool)[1].endswith("plain.ply") and tool_request(tool)[2].endswith("made.spz")
-    assert json.loads((tmp_path / "phone_x0.25.spz.adaptation.json").read_text())["scale"] == 0.25
+    assert report_of(tmp_path / "phone_x0.25.spz")["scale"] == 0.25
     assert {path.name for path in tmp_path.iterdir()} == {"phone.spz", "phone_x0.25.spz", "phone_x0.25.spz.adaptation.json"}
     assert main(["adapt", str(tmp_path / "phone.spz"), "--scale", "1/4", "--recipe", "instant"]) == 2
     assert "--overwrite" in capsys.readouterr().err
@@ -93,9 +91,8 @@ def test_splats_that_not_all_viewers_of_a_format_draw_as_trained_are_told_of(tmp
     words = ["adapt", str(base), "--scale", "1/2", "--recipe", "instant", "--screen-filter", "antialiased", "--output", str(output)]
     assert main([*words, *(["--viewer", viewer] if viewer else [])]) == 0
     told = f"(antialiased, 0.3 px²), which not all viewers of {ending} do"
-    report = json.loads(output.with_name(output.name + ".adaptation.json").read_text())
     count = int(viewer is None and ending != ".ply")
-    assert capsys.readouterr().err.count(told) == sum(told in note for note in report["notes"]) == count
+    assert capsys.readouterr().err.count(told) == sum(told in note for note in report_of(output)["notes"]) == count
 
 
 @pytest.mark.parametrize("ending", [".spz", ".compressed.ply"])
@@ -104,11 +101,12 @@ def test_columns_that_a_format_has_no_place_for_are_told_of_and_in_the_report(tm
     columns = {**read_ply(tiny.ply(tmp_path / "a.ply")).columns, "confidence": np.ones(60, np.float32), "nx": np.ones(60, np.float32)}
     write(tmp_path / "b.ply", columns)
     told = f"the extra columns nx, ny, nz, confidence are dropped, since {ending} has no place for them; a .ply has"
-    assert main(["adapt", str(tmp_path / "b.ply"), "--scale", "1", "--output", str(tmp_path / f"c{ending}")]) == 0
+    file = tmp_path / f"c{ending}"
+    assert main(["adapt", str(tmp_path / "b.ply"), "--scale", "1", "--output", str(file)]) == 0
     assert capsys.readouterr().err.count(told) == 1
-    assert told in json.loads((tmp_path / f"c{ending}.adaptation.json").read_text())["notes"]
+    assert told in report_of(file)["notes"]
     assert main(["adapt", str(tmp_path / "b.ply"), "--scale", "1", "--output", str(tmp_path / "d.ply")]) == 0
-    assert json.loads((tmp_path / "d.ply.adaptation.json").read_text())["notes"] == []
+    assert report_of(tmp_path / "d.ply")["notes"] == []
 
 
 @pytest.mark.parametrize("ending", [".spz", ".compressed.ply", ".ply"])
@@ -123,8 +121,7 @@ def test_what_spz_cuts_off_is_told_of_and_in_the_report(tmp_path, tool, ending, 
     assert main(["adapt", str(tmp_path / "b.ply"), "--scale", "1", "--output", str(made)]) == 0
     lost = "1 longer than 379 units, 4 shorter than 4.5e-05 units, 2 with a color of degree 0 outside -0.44 to 1.44, 1 with other harmonics"
     told = f"SPZ cuts off, of 60 splats, {lost} outside -1 to 1; a .ply keeps them"
-    count, notes = int(ending == ".spz"), json.loads(made.with_name(made.name + ".adaptation.json").read_text())["notes"]
-    assert capsys.readouterr().err.count(told) == count and notes.count(told) == count
+    assert capsys.readouterr().err.count(told) == report_of(made)["notes"].count(told) == int(ending == ".spz")
 
 
 @pytest.mark.parametrize("ending", [".spz", ".compressed.ply", ".ply"])
@@ -132,7 +129,7 @@ def test_bands_that_splat_transform_does_not_write_are_left_out_and_told_of(tmp_
     base, made = tiny.ply(tmp_path / "a.ply", degree=4), tmp_path / f"b{ending}"
     assert main(["adapt", str(base), "--scale", "1", "--output", str(made)]) == 0
     told, count = "SH bands above degree 3 are dropped, which splat-transform does not write; a .ply has them", int(ending != ".ply")
-    assert capsys.readouterr().err.count(told) == json.loads(made.with_name(made.name + ".adaptation.json").read_text())["notes"].count(told) == count
+    assert capsys.readouterr().err.count(told) == report_of(made)["notes"].count(told) == count
     written, rest = read_ply(made).columns, [f"f_rest_{number}" for number in range(45 if count else 72)]  # the stand-in writes what it is given
     assert [name for name in written if name.startswith("f_rest")] == rest
     own = load_model(base).parameters()["shN"][:, 14, 2].detach()
@@ -159,7 +156,7 @@ def test_any_splats_are_written_so_where_the_name_asks_for_it(tmp_path, tool, na
 
 
 def test_a_failed_writing_leaves_the_old_file(tmp_path, tool):
-    (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\nprint('no room', file=sys.stderr)\nsys.exit(3)\n")
+    answer_by(tool, "print('no room', file=sys.stderr)\nsys.exit(3)")
     (tmp_path / "out.spz").write_bytes(b"old")
     with pytest.raises(OutputError, match="no room"):
         tiny.model().save(tmp_path / "out.spz", provenance={}, overwrite=True)
@@ -217,11 +214,11 @@ def test_levels_in_tiles_are_refused_of_such_splats_before_any_work(tmp_path, to
 
 
 def test_a_splat_transform_that_is_too_old_for_sog_is_found_before_the_work(tmp_path, tool):
-    (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\nprint('splat-transform v2.6.0 (b42b60c)', file=sys.stderr)\n")
+    answer_by(tool, "print('splat-transform v2.6.0 (b42b60c)', file=sys.stderr)")
     with pytest.raises(SettingsError, match=r"splat-transform 2.6.0 is too old for it, and 2.7 or newer is needed"):
         tiny.model().refuse_output(tmp_path / "a.sog", overwrite=False, networks_move=False)
     tiny.model().refuse_output(tmp_path / "a.spz", overwrite=False, networks_move=False)
-    (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\nprint('splat-transform v2.0.6', file=sys.stderr)\n")
+    answer_by(tool, "print('splat-transform v2.0.6', file=sys.stderr)")
     with pytest.raises(SettingsError, match=r"2.0.6 is too old for it, and 2.1 or newer is needed; run: npm install -g \S+; or give a .ply"):
         tiny.model().refuse_output(tmp_path / "a.spz", overwrite=False, networks_move=False)
     with pytest.raises(SettingsError, match=r"3.0 or newer is needed, which needs Node.js 22; run: npm install -g \S+; or leave Streamed SOG out$"):
@@ -248,12 +245,11 @@ def test_the_db_of_a_file_are_of_what_its_format_keeps(tmp_path, capsys):
     source = tiny.ply(tmp_path / "scan.ply")
     assert main(["adapt", str(source), *words, "--output", str(tmp_path / "scan.spz"), "--report"]) == 0
     said = capsys.readouterr()
-    report = json.loads((tmp_path / "scan.spz.adaptation.json").read_text())
+    report = report_of(tmp_path / "scan.spz")
     exact = next(psnr for state, psnr in report["validation"].items() if report["returned"].startswith(state))
     assert report["written"] < exact - 1
     assert f"-> {report['written']:.2f} dB on views" in said.out
-    page = (tmp_path / "scan.spz.report.html").read_text()
-    record = json.loads(re.search(r'<script type="application/json" id="record">(.*?)</script>', page, re.DOTALL)[1])
+    record = record_of(tmp_path / "scan.spz.report.html")
     [picture] = [picture for picture in record["zooms"][0]["pictures"] if picture["role"] == "adapted"]
     assert picture["mean"] == {"psnr_db": report["written"]} and picture["view"]["psnr_db"] < exact - 1
     assert f"→ {report['written']:.1f} dB on views" in record["lead"] and record["adaptations"][0]["written"] == report["written"]
@@ -268,7 +264,7 @@ def test_a_page_has_the_db_of_a_file_whose_path_is_relative(tmp_path, monkeypatc
     tiny.ply(tmp_path / "scan.ply")
     monkeypatch.chdir(tmp_path)
     assert main(["adapt", "scan.ply", "--scale", "1/4", "--steps", "0", "--output", "new.spz", "--report", "--quiet"]) == 0
-    written = json.loads((tmp_path / "new.spz.adaptation.json").read_text())["written"]
+    written = report_of(tmp_path / "new.spz")["written"]
     assert rf"\u2192 {written:.1f} dB on views" in (tmp_path / "new.spz.report.html").read_text()
 
 
@@ -276,11 +272,11 @@ def test_a_page_has_the_db_of_a_file_whose_path_is_relative(tmp_path, monkeypatc
 def test_the_db_in_each_of_several_viewers_are_of_what_a_format_keeps(tmp_path):
     adapted = wrap_model(tiny.ply(tmp_path / "scan.ply")).adapt(1 / 4, steps=0, merge_to=1.0, viewer="portable")
     exact, files = adapted.report.viewers, [adapted.save(tmp_path / f"a.{suffix}") for suffix in ("ply", "spz")]
-    ply, spz = (json.loads(file.with_name(f"{file.name}.adaptation.json").read_text())["viewers"] for file in files)
+    ply, spz = (report_of(file)["viewers"] for file in files)
     assert ply == exact and spz.keys() == exact.keys() and spz["classic"] < exact["classic"] - 1
 
 
 def test_a_ply_is_not_measured_again(tmp_path, capsys):
     words = ["--scale", "1/4", "--steps", "0"]
     assert main(["adapt", str(tiny.ply(tmp_path / "scan.ply")), *words, "--output", str(tmp_path / "out.ply")]) == 0
-    assert json.loads((tmp_path / "out.ply.adaptation.json").read_text())["written"] is None
+    assert report_of(tmp_path / "out.ply")["written"] is None

@@ -5,8 +5,11 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import count
 from typing import Any
+
+import pytest
 
 from mipmap_plugin.formats import staging
 
@@ -14,6 +17,8 @@ from mipmap_plugin.formats import staging
 CALLS = {"open", "write", "flush", "close", "__exit__", "fsync", "truncate", "mkdir", "rmdir", "rename", "replace", "unlink", "remove", "flock"}
 CALLS |= {"sendfile", "copy_file_range", "symlink", "link", "utime", "chmod", "fchmod"}
 PLACES = {"posix", "_io", "io", "fcntl"}
+# By default one call in as many; no divisor of the calls that a file takes, so that in the end each kind has its turn.
+FEW = 7
 
 
 class Before:
@@ -52,3 +57,8 @@ def killed(number: int, job: Callable[[], Any], by: int = signal.SIGKILL) -> boo
     status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     assert status in (0, 130, -signal.SIGKILL), f"the job itself failed ({status})"
     return status != 0
+
+
+def numbers(request: pytest.FixtureRequest, few: int = FEW) -> Iterator[int]:
+    """Of the calls to be broken off at: each in the slow tests, and else one in `few`, which is fast."""
+    return count(1, 1 if request.node.get_closest_marker("slow") else few)

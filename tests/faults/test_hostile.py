@@ -11,7 +11,6 @@ import struct
 import subprocess
 import sys
 import zipfile
-import zlib
 from collections import OrderedDict
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,10 +19,10 @@ import numpy as np
 import pytest
 import torch
 from corpus import SAMPLES
-from PIL import Image
+from png_files import RGBA, write_png
 
-from mipmap_plugin.errors import CheckpointError, MipmapPluginError, SceneError, SettingsError
-from mipmap_plugin.formats.images import composite, read_image
+from mipmap_plugin.errors import CheckpointError, MipmapPluginError, SettingsError
+from mipmap_plugin.formats.images import read_image
 from mipmap_plugin.formats.state_dict import read_state_dict
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.formats.torchscript import read_torchscript
@@ -141,19 +140,6 @@ def packed(path: Path) -> Path:
     return path
 
 
-def png(path: Path, width: int, height: int, channels: int) -> Path:
-    """A PNG of zeros, packed row by row."""
-    packer, packed = zlib.compressobj(1), io.BytesIO()
-    for _ in range(height):
-        packed.write(packer.compress(bytes(1 + width * channels)))
-    packed.write(packer.flush())
-    head = struct.pack(">IIBBBBB", width, height, 8, {3: 2, 4: 6}[channels], 0, 0, 0)
-    parts = {b"IHDR": head, b"IDAT": packed.getvalue(), b"IEND": b""}
-    chunks = [struct.pack(">I", len(part)) + name + part + struct.pack(">I", zlib.crc32(name + part)) for name, part in parts.items()]
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
-    return path
-
-
 def test_no_small_file_takes_much_memory(tmp_path):
     executed = "holds more than plain tensors and is not executed"
     one = {"0": bytes(4)}
@@ -165,8 +151,8 @@ def test_no_small_file_takes_much_memory(tmp_path):
         ("torch", grows): executed,
         ("torch", packed(tmp_path / "packed.pth")): "its numbers unpack to more than it is on disk",
         ("script", script): "its tensors claim more numbers than the file holds",
-        ("image", png(tmp_path / "bomb.png", 5000, 5000, 4)): "no photograph",
-        ("image", png(tmp_path / "sound.png", 2000, 2000, 4)): "read",
+        ("image", write_png(tmp_path / "bomb.png", (5000, 5000), RGBA, bytes(5000 * 5000 * 4))): "no photograph",
+        ("image", write_png(tmp_path / "sound.png", (2000, 2000), RGBA, bytes(2000 * 2000 * 4))): "read",
     }
     for (path, (memory, said)), sentence in zip(taken(list(wanted)).items(), wanted.values(), strict=True):
         assert sentence in said and memory < 2000 * 2000 * 40 / MIB, (path.name, memory, said)
@@ -218,31 +204,6 @@ def test_nested_names_take_a_time_that_grows_with_the_file(tmp_path):
     path = torch_file(tmp_path / "a.pt", nested(["name"] * 30_000), {"0": bytes(4)})
     with within(10), pytest.raises(CheckpointError, match="its modules are nested too deep, or their names too long"):
         read_torchscript(path)
-
-
-# Images
-
-
-def test_a_picture_beyond_the_memory_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.limits.memory", lambda _: 1000.0)
-    with pytest.raises(SceneError, match=r"a\.png: an image of 20 x 20 px needs .* and this machine has"):
-        read_image(png(tmp_path / "a.png", 20, 20, 3), (0, 0, 0))
-
-
-def test_compositing_in_parts_is_compositing(monkeypatch):
-    rgba = np.random.default_rng(0).integers(0, 256, (37, 11, 4), dtype=np.uint8)
-    whole = composite(rgba, (0.2, 0.5, 1.0))
-    color, alpha = rgba[..., :3] / 255.0, rgba[..., 3:] / 255.0
-    assert np.array_equal(whole, ((color * alpha + np.array([0.2, 0.5, 1.0]) * (1 - alpha)) * 255.0).astype(np.uint8))
-    monkeypatch.setattr("mipmap_plugin.formats.images.TOGETHER", 50)
-    assert np.array_equal(composite(rgba, (0.2, 0.5, 1.0)), whole)
-
-
-def test_a_picture_that_is_a_program_is_not_run(tmp_path):
-    Image.new("RGB", (4, 4)).save(tmp_path / "a.eps")
-    (tmp_path / "a.eps").rename(tmp_path / "a.png")
-    with pytest.raises(SceneError, match=r"a\.png: is not an image that Pillow reads"):
-        read_image(tmp_path / "a.png", (0, 0, 0))
 
 
 # What is no file

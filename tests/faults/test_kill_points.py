@@ -6,16 +6,14 @@ import hashlib
 import os
 import shutil
 import signal
-from collections.abc import Iterator
-from itertools import count
 from pathlib import Path
 from typing import Any
 
-import kill_points
 import pytest
 import tiny
 from corpus import SAMPLES
-from test_interruptions import WRITERS, adapted, contents
+from kill_points import killed, numbers
+from writers import WRITERS, adapted, base_and_output, contents
 
 from mipmap_plugin.adaptation.optimization import resume
 from mipmap_plugin.formats import staging
@@ -24,16 +22,8 @@ from mipmap_plugin.wrap import wrap_model
 
 pytestmark = [pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork"), pytest.mark.usefixtures("few_views")]
 
-# By default one call in as many; no divisor of the calls that a file takes, so that in the end each kind has its turn.
-FEW = 7
-
 LONE = [name for name in WRITERS if SAMPLES[name].damaged.endswith((".ply", "opacity_mlp.pt"))]
 FOLDERS = [name for name in WRITERS if name not in LONE]
-
-
-def numbers(request: pytest.FixtureRequest, few: int = FEW) -> Iterator[int]:
-    """Of the calls to be broken off at: each in the slow tests, and else one in `few`, which is fast."""
-    return count(1, 1 if request.node.get_closest_marker("slow") else few)
 
 
 def some(names: list[str], by_default: list[str]) -> list[Any]:
@@ -49,9 +39,8 @@ class Replacing:
     """A saved output that another model replaces, as often as one likes."""
 
     def __init__(self, folder: Path, name: str) -> None:
-        base = SAMPLES[name].make(folder / "base")
+        base, self.out = base_and_output(folder, name)
         self.models = [adapted(base, scale) for scale in (1 / 2, 1 / 4)]
-        self.out = folder / "out" / ("new.ply" if base.suffix == ".ply" else "new")
         self.models[1].save(self.out)
         self.new = contents(self.out.parent)
         shutil.rmtree(self.out.parent)
@@ -84,7 +73,7 @@ def test_saving_broken_off_leaves_the_old_or_the_new_output(tmp_path, name, by, 
     replacing = Replacing(tmp_path, name)
     for number in numbers(request):
         replacing.again()
-        if not kill_points.killed(number, replacing, by):
+        if not killed(number, replacing, by):
             break
         replacing.check()
     assert number > 20
@@ -96,7 +85,7 @@ def test_where_folders_cannot_be_exchanged_the_next_run_finishes_the_move(tmp_pa
     replacing = Replacing(tmp_path, name)
     for number in numbers(request):
         replacing.again()
-        if not kill_points.killed(number, replacing):
+        if not killed(number, replacing):
             break
         replacing.check(at_once=False)
     assert number > 20
@@ -116,8 +105,7 @@ class Adapting:
     """A whole run, its state kept at every step, that saves to one output."""
 
     def __init__(self, folder: Path, name: str) -> None:
-        self.base = SAMPLES[name].make(folder / "base")
-        self.out = folder / "out" / ("new.ply" if self.base.suffix == ".ply" else "new")
+        self.base, self.out = base_and_output(folder, name)
         self.state = self.out.with_name(self.out.name + ".resume")
 
     def __call__(self) -> None:
@@ -133,7 +121,7 @@ def test_a_run_killed_at_any_point_is_finished_by_the_same_command(tmp_path, mon
     whole = made(adapting.out)
     for number in numbers(request, few=37):
         shutil.rmtree(adapting.out.parent, ignore_errors=True)
-        if not kill_points.killed(number, adapting):
+        if not killed(number, adapting):
             break
         adapting()
         assert made(adapting.out) == whole

@@ -10,6 +10,7 @@ import pytest
 import tiny
 import torch
 from corpus import SAMPLES
+from writers import base_and_output
 
 from mipmap_plugin import limits
 from mipmap_plugin.cli import main
@@ -157,9 +158,8 @@ def test_a_live_model_of_another_family_with_a_nan_is_refused(tmp_path):
 @pytest.mark.parametrize("value", [math.nan, math.inf, 1e30])
 def test_nothing_that_is_not_finite_is_ever_saved(tmp_path, name, value):
     """Whatever an adaptation does to a model."""
-    base = SAMPLES[name].make(tmp_path / "base")
-    model = load_model(base).copy()
-    out = tmp_path / "out" / ("new.ply" if base.suffix == ".ply" else "new")
+    base, out = base_and_output(tmp_path, name)
+    model = load_model(base)
     for parameter in ("means", "scales"):
         broken = model.copy()
         with torch.no_grad():

@@ -6,9 +6,8 @@ import os
 import shutil
 from itertools import product
 
-import kill_points
 import pytest
-from test_kill_points import numbers
+from kill_points import killed, numbers
 
 from mipmap_plugin.errors import OutputError
 from mipmap_plugin.formats import staging
@@ -56,7 +55,7 @@ def test_what_is_spent_is_there_until_the_output_is_and_not_after(tmp_path, monk
     kept, seen = {"out.resume", "out.tiles"}, set()
     for number in numbers(request):
         begin(out.parent, files, replaced)
-        if not kill_points.killed(number, lambda: write(out, "new", files)):
+        if not killed(number, lambda: write(out, "new", files)):
             break
         text = text_of(settled(out))
         left = {path.name for path in out.parent.iterdir()} & kept
@@ -70,9 +69,9 @@ def test_what_is_spent_is_there_until_the_output_is_and_not_after(tmp_path, monk
 def test_what_another_run_has_put_there_since_is_not_taken_for_spent(tmp_path, monkeypatch):
     begin(tmp_path / "place", 1, replaced=False)
     out, state = tmp_path / "place" / "out", tmp_path / "place" / "out.resume"
-    with monkeypatch.context() as killed:
-        killed.setattr(staging, "_remove", lambda *_: None)
-        killed.setattr(staging.Staging, "close", lambda self: os.close(self._lock))
+    with monkeypatch.context() as dead:
+        dead.setattr(staging, "_remove", lambda *_: None)
+        dead.setattr(staging.Staging, "close", lambda self: os.close(self._lock))
         write(out, "new", 1)
     new = state.with_name("other")  # a file of its own, so that its inode is another
     new.write_text("of another run")

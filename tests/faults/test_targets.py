@@ -5,20 +5,18 @@ from __future__ import annotations
 import os
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import tiny
 import torch
 from corpus import SAMPLES
-from test_interruptions import WRITERS, adapted, contents
+from writers import WRITERS, adapted, base_and_output, contents
 
-from mipmap_plugin.adaptation.optimization import resume
-from mipmap_plugin.adaptation.optimization.state_file import claim_state_file
 from mipmap_plugin.adaptation.target import disk_cache
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import OutputError, OutputExists, SettingsError
 from mipmap_plugin.formats import atomic as files
-from mipmap_plugin.formats import staging
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.levels.room import room_for
 from mipmap_plugin.models import load_model
@@ -41,6 +39,11 @@ def refused(capsys):
         return said.err
 
     return call
+
+
+@pytest.fixture
+def no_work(monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.wrap.Wrapped.adapt", lambda *_, **__: pytest.fail("worked in vain"))
 
 
 def names_of(base: Path, folder: Path) -> list[Path]:
@@ -96,9 +99,8 @@ def test_what_was_adapted_before_may_be_overwritten_also_among_the_base(tmp_path
 
 
 @pytest.mark.parametrize("words", [[], ["--overwrite"]])
-def test_nodes_that_are_no_files_are_refused_before_any_work(tmp_path, refused, monkeypatch, words):
+def test_nodes_that_are_no_files_are_refused_before_any_work(tmp_path, refused, no_work, words):
     base = tiny.ply(tmp_path / "base.ply")
-    monkeypatch.setattr("mipmap_plugin.wrap.Wrapped.adapt", lambda *_, **__: pytest.fail("worked in vain"))
     (tmp_path / "dangling.ply").symlink_to(tmp_path / "nothing")
     (tmp_path / "loop.ply").symlink_to(tmp_path / "loop.ply")
     os.mkfifo(tmp_path / "pipe.ply")
@@ -110,8 +112,7 @@ def test_nodes_that_are_no_files_are_refused_before_any_work(tmp_path, refused, 
         (tmp_path / f"new.ply{beside}").unlink()
 
 
-def test_what_cannot_be_saved_is_refused_before_any_work(tmp_path, refused, monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.wrap.Wrapped.adapt", lambda *_, **__: pytest.fail("worked in vain"))
+def test_what_cannot_be_saved_is_refused_before_any_work(tmp_path, refused, no_work, monkeypatch):
     moving, anchors = SAMPLES["deform.pth"].make(tmp_path / "moving"), SAMPLES["opacity_mlp.pt"].make(tmp_path / "anchors")
     base, full = tiny.ply(tmp_path / "base.ply"), tmp_path / "full"
     full.mkdir()
@@ -123,7 +124,7 @@ def test_what_cannot_be_saved_is_refused_before_any_work(tmp_path, refused, monk
     assert "is not written as SPLAT" in refused("adapt", base, *words, tmp_path / "new.splat")
     assert "is the root of a disk" in refused("adapt", base, *words, "/")
     assert "is a folder with other things in it" in refused("adapt", moving, *words, full)
-    assert "is a folder, which no file replaces" in refused("adapt", base, *words[:-2], "--overwrite", "--output", _named(full, "full.ply"))
+    assert "is a folder, which no file replaces" in refused("adapt", base, *words, full.rename(tmp_path / "full.ply"))
     splats = anchors / "point_cloud/iteration_30000/point_cloud.ply"
     beside = splats.with_name("new.ply")
     assert "holds other networks" in refused("adapt", splats, "--scale", "1/2", "--output", beside)
@@ -131,7 +132,7 @@ def test_what_cannot_be_saved_is_refused_before_any_work(tmp_path, refused, monk
     assert "its disk has 10 bytes free, and the base takes" in refused("adapt", base, *words, tmp_path / "new.ply")
 
 
-def test_a_disk_without_room_for_levels_or_tiles_is_noticed_before_any_work(tmp_path, refused, monkeypatch):
+def test_a_disk_without_room_for_levels_or_tiles_is_noticed_before_any_work(tmp_path, refused, no_work, monkeypatch):
     """Both keep a copy until all is done; what goes on has made that one already."""
     base = tiny.folder(tmp_path / "base")
     size = next(base.rglob("*.ply")).stat().st_size
@@ -143,7 +144,6 @@ def test_a_disk_without_room_for_levels_or_tiles_is_noticed_before_any_work(tmp_
     assert 2.8 < levels / (60 * 26 * 4) <= 3
     free = [0]
     monkeypatch.setattr(files.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 0, free[0]))
-    monkeypatch.setattr("mipmap_plugin.wrap.Wrapped.adapt", lambda *_, **__: pytest.fail("worked in vain"))
     monkeypatch.setattr("mipmap_plugin.tiles.plan.make_cut", lambda *_: pytest.fail("worked in vain"))
     for words, room, told in ((ladder, levels, "the levels take about"), (tiled, 2 * size, "the tiles take at least")):
         free[0] = room - 1
@@ -159,8 +159,7 @@ def test_a_disk_without_room_for_levels_or_tiles_is_noticed_before_any_work(tmp_
         assert f"{room:,}" in refused(*words)
 
 
-def test_a_format_that_nothing_here_writes_is_refused_before_any_work(tmp_path, refused, monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.wrap.Wrapped.adapt", lambda *_, **__: pytest.fail("worked in vain"))
+def test_a_format_that_nothing_here_writes_is_refused_before_any_work(tmp_path, refused, no_work, monkeypatch):
     monkeypatch.setenv("PATH", "")
     base = tiny.ply(tmp_path / "base.ply")
     assert "run: npm install" in refused("adapt", base, "--scale", "1/2", "--output", tmp_path / "new.spz", *INSTANT)
@@ -174,10 +173,6 @@ def test_the_working_folder_is_a_folder_like_others(tmp_path, refused, monkeypat
     assert "holds the base checkpoint itself" in refused("adapt", base, "--scale", "1/2", "--output", output, "--overwrite", *INSTANT)
     monkeypatch.chdir(tmp_path / "here")
     assert "pass --overwrite" in refused("adapt", base, "--scale", "1/2", "--output", output, *INSTANT)
-
-
-def _named(path: Path, name: str) -> Path:
-    return path.rename(path.with_name(name))
 
 
 def test_other_commands_spare_the_checkpoint_too(tmp_path, refused):
@@ -195,12 +190,8 @@ def test_other_commands_spare_the_checkpoint_too(tmp_path, refused):
 
 @pytest.mark.parametrize("name", WRITERS)
 def test_an_output_error_names_the_output(tmp_path, monkeypatch, name):
-    base = SAMPLES[name].make(tmp_path / "base")
-    out, new = tmp_path / ("new.ply" if base.suffix == ".ply" else "new"), adapted(base, 1 / 2)
-
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
-
+    base, out = base_and_output(tmp_path, name)
+    new, full = adapted(base, 1 / 2), Mock(side_effect=OSError(28, "No space left on device"))
     monkeypatch.setattr(os, "fsync", full)
     monkeypatch.setattr(torch, "save", full)
     with pytest.raises(OutputError) as told:
@@ -220,84 +211,12 @@ def test_no_model_appears_without_its_report(tmp_path, monkeypatch):
         assert not (tmp_path / "out").exists()
 
 
-# States of runs at the same time
-
-
-def test_runs_with_one_output_keep_their_states_in_files_of_their_own(tmp_path, monkeypatch):
-    monkeypatch.setattr(resume, "SAVE_EVERY_S", 0.0)
-    model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2)), tmp_path / "state"
-    first = model.adapt(1 / 4, steps=1, resume=state)
-    second = model.adapt(1 / 4, steps=2, resume=state)
-    assert torch.load(state, weights_only=True)["step"] == 1 and torch.load(tmp_path / "state.2", weights_only=True)["step"] == 2
-    first.save(tmp_path / "one.ply")
-    assert not state.exists() and (tmp_path / "state.2").exists()
-    second.save(tmp_path / "two.ply")
-    assert sorted(path.name for path in tmp_path.iterdir() if "state" in path.name) == []
-
-
-def test_a_run_that_is_saved_again_leaves_the_state_of_the_next_run(tmp_path, monkeypatch):
-    monkeypatch.setattr(resume, "SAVE_EVERY_S", 0.0)
-    model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2)), tmp_path / "state"
-    first = model.adapt(1 / 4, steps=1, resume=state)
-    first.save(tmp_path / "one.ply")
-    second = model.adapt(1 / 4, steps=2, resume=state)
-    first.save(tmp_path / "copy.ply")
-    assert {path.name for path in tmp_path.iterdir() if "state" in path.name} == {"state", ".state.lock"}
-    second.save(tmp_path / "two.ply")
-    assert not state.exists()
-
-
-def test_each_interrupted_run_goes_on_from_its_own_state(tmp_path, monkeypatch):
-    monkeypatch.setattr(resume, "SAVE_EVERY_S", 0.0)
-    model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2)), tmp_path / "state"
-    living = [model.adapt(1 / 4, steps=steps, resume=state) for steps in (1, 2)]
-    curves = [each.report.curve for each in living]
-    del living  # neither was saved
-    assert model.adapt(1 / 4, steps=2, resume=state).report.curve == curves[1]
-    with pytest.raises(SettingsError, match="state: this state belongs to another base, settings or views"):
-        model.adapt(1 / 4, steps=3, resume=state)
-
-
-def test_a_state_is_nobodys_pipe_or_folder(tmp_path):
-    os.mkfifo(tmp_path / "pipe")
-    model = wrap_model(tiny.model(10), cameras=tiny.cameras(2))
-    for name, told in {"pipe": "is a pipe", ".": "is a folder"}.items():
-        with pytest.raises(OutputExists, match=told):
-            model.adapt(1 / 4, steps=1, resume=tmp_path / name)
-
-
-def test_a_state_that_cannot_be_kept_costs_a_warning(tmp_path, monkeypatch):
-    def refused(*_):
-        raise OSError(30, "Read-only file system")
-
-    monkeypatch.setattr("mipmap_plugin.adaptation.optimization.resume.claim_state_file", refused)
-    model = wrap_model(tiny.model(10), cameras=tiny.cameras(2))
-    with pytest.warns(UserWarning, match=r"state cannot be written \(Read-only file system\), so that this run could not be resumed"):
-        assert model.adapt(1 / 4, steps=1, resume=tmp_path / "state").report.ended_by == "1 step"
-
-
-def test_states_beyond_the_last_are_refused(tmp_path):
-    living = [claim_state_file(tmp_path / "state", lambda _: "belongs to another") for _ in range(staging.SLOTS)]
-    assert len({each.path for each in living}) == staging.SLOTS
-    with pytest.raises(SettingsError, match="state"):
-        claim_state_file(tmp_path / "state", lambda _: "belongs to another")
+def test_a_name_that_leaves_no_room_for_a_reports_is_read(tmp_path):
+    base = tiny.ply(tmp_path / "base.ply", count=20).rename(tmp_path / f"{'a' * 246}.ply")
+    assert main(["adapt", str(base), "--scale", "1/2", "--output", str(tmp_path / "new.ply"), *INSTANT]) == 0
 
 
 # The cache
-
-
-def test_ctrl_c_while_a_state_is_let_go_of_leaves_nothing_to_do_again(tmp_path, monkeypatch):
-    """Its lock was closed a second time, as the object went, which was printed with a traceback."""
-
-    def broken_off(folder, lock):
-        os.close(lock)
-        raise KeyboardInterrupt
-
-    file = claim_state_file(tmp_path / "state", lambda _: "")
-    monkeypatch.setattr("mipmap_plugin.adaptation.optimization.state_file.release", broken_off)
-    with pytest.raises(KeyboardInterrupt):
-        file.release()
-    file.release()
 
 
 @pytest.mark.parametrize("folder", ["a file", "a file/below"])
@@ -316,8 +235,3 @@ def test_a_cache_that_holds_something_else_is_made_anew(tmp_path, monkeypatch, c
     torch.save(content, tmp_path / "ab/ab.pt")
     assert torch.equal(disk_cache.cached("ab", lambda: torch.zeros(2, 2, 3)), torch.zeros(2, 2, 3))
     assert torch.equal(disk_cache.cached("ab", lambda: pytest.fail("made again")), torch.zeros(2, 2, 3))
-
-
-def test_a_name_that_leaves_no_room_for_a_reports_is_read(tmp_path):
-    base = tiny.ply(tmp_path / "base.ply", count=20).rename(tmp_path / f"{'a' * 246}.ply")
-    assert main(["adapt", str(base), "--scale", "1/2", "--output", str(tmp_path / "new.ply"), *INSTANT]) == 0

@@ -13,21 +13,12 @@ from mipmap_plugin.formats import staging
 from mipmap_plugin.formats.atomic import json_text, new_file, new_folder, refuse_output, refuse_to_lose, refuse_unwritable, together, write_json
 from mipmap_plugin.formats.staging import settle
 
-FACTS = {"psnr_db": math.inf, "rows": [{"gain": -math.inf}, (1.5, math.nan)], "name": "Infinity", "count": 3, "known": True, "none": None}
-WRITTEN = {"psnr_db": None, "rows": [{"gain": None}, [1.5, None]], "name": "Infinity", "count": 3, "known": True, "none": None}
 
-
-def refuse(constant):
-    raise AssertionError(f"{constant} is no JSON")
-
-
-def test_numbers_that_json_lacks_are_null():
-    assert json.loads(json_text(FACTS), parse_constant=refuse) == WRITTEN
-
-
-def test_so_are_those_of_a_file(tmp_path):
-    write_json(tmp_path / "a.json", FACTS, overwrite=False)
-    assert json.loads((tmp_path / "a.json").read_text(), parse_constant=refuse) == WRITTEN
+def test_numbers_that_json_lacks_are_null(tmp_path):
+    facts = {"psnr_db": math.inf, "rows": [{"gain": -math.inf}, (1.5, math.nan)], "name": "Infinity", "count": 3, "known": True, "none": None}
+    write_json(tmp_path / "a.json", facts, overwrite=False)
+    read = json.loads((tmp_path / "a.json").read_text(), parse_constant=lambda constant: pytest.fail(f"{constant} is no JSON"))
+    assert read == facts | {"psnr_db": None, "rows": [{"gain": None}, [1.5, None]]}
 
 
 @pytest.mark.parametrize("value", [0.1, -1e300, 10**30, 1e-320])
@@ -69,7 +60,7 @@ def test_a_link_is_replaced_and_what_it_leads_to_stays(tmp_path):
     assert ((tmp_path / "far").read_text(), (tmp_path / "near").read_text()) == ("precious", "new")
 
 
-@pytest.mark.parametrize("path", ["/", "", ".", "..", "a/..", "x" * 300, "a\0b"])
+@pytest.mark.parametrize("path", ["/", "", ".", "..", "a/..", "x" * 300, f"{'x' * 300}/a", "a\0b"])
 def test_paths_that_no_file_can_have_end_in_one_sentence(tmp_path, monkeypatch, path):
     monkeypatch.chdir(tmp_path)
     with pytest.raises((OutputExists, OutputError)):
@@ -88,11 +79,6 @@ def test_the_base_is_known_by_every_name_that_it_has(tmp_path):
         with pytest.raises(OutputExists, match="the base checkpoint itself"):
             refuse_output(tmp_path / name, True, [base])
     refuse_output(tmp_path / "base/other.ply", True, [base])
-
-
-def test_a_name_that_no_disk_takes_is_told_in_a_sentence(tmp_path):
-    with pytest.raises(OutputError, match=r"a\.ply cannot be written: File name too long"), new_file(tmp_path / ("n" * 300) / "a.ply", True):
-        pass
 
 
 def test_a_disk_without_room_or_leave_is_refused_before_any_work(tmp_path, monkeypatch):

@@ -20,13 +20,17 @@ from mipmap_plugin.formats.readers import refuse_unread
 from mipmap_plugin.models import detect, load_model
 from mipmap_plugin.models.adapted_name import adapted_name
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting.harmonics import basis, rotated
 from mipmap_plugin.splatting.projection import axes_of
 
 HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))  # from y up to a PLY's frame, about z
 # A rotation by 120 degrees about (1, 1, 1), x -> y -> z -> x, as a quaternion xyzw.
 CYCLE, CYCLED = [0.5, 0.5, 0.5, 0.5], torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+
+
+def load(tmp_path, made, data):
+    """The splats of a document that is written as a GLB."""
+    return load_model(gltf_files.write_glb(tmp_path / "a.glb", made, data)).gaussians()
 
 
 def covariances(splats):
@@ -69,8 +73,7 @@ def test_nodes_turn_scale_and_move_splats(tmp_path):
     matrix = np.eye(4)
     matrix[:3, 3] = 1, 2, 3
     nodes = [{"matrix": matrix.T.flatten().tolist(), "children": [1]}, {"mesh": 0, "rotation": CYCLE, "scale": [2, 2, 2]}]
-    made, data = gltf_files.document(gltf_files.attributes(splats), nodes=nodes)
-    read = load_model(gltf_files.write_glb(tmp_path / "a.glb", made, data)).gaussians()
+    read = load(tmp_path, *gltf_files.document(gltf_files.attributes(splats), nodes=nodes))
     assert_moved(read, splats, HALF_TURN @ CYCLED, 2.0, (-1.0, -2.0, 3.0))
 
 
@@ -80,7 +83,7 @@ def test_primitives_are_joined_and_other_meshes_left_out(tmp_path):
     made["meshes"].append({"primitives": [{"attributes": {"POSITION": 0}}]})
     made["nodes"].append({"mesh": 2})
     made["scenes"][0]["nodes"].append(2)
-    read = load_model(gltf_files.write_glb(tmp_path / "a.glb", made, data)).gaussians()
+    read = load(tmp_path, made, data)
     assert len(read) == 30 and read.sh_degree == 1 and not read.sh[10:, 1:].any()
     torch.testing.assert_close(read.sh[10:, 0], parts[1].sh[:, 0])
 
@@ -90,7 +93,7 @@ def test_whole_numbers_are_fractions_of_the_largest(tmp_path):
     named = gltf_files.attributes(splats)
     for name, kind in {"ROTATION": "<i2", "SCALE": "<u2", "OPACITY": "<u1"}.items():
         named[f"{EXTENSION}:{name}"] = (named[f"{EXTENSION}:{name}"] * np.iinfo(kind).max).round().astype(kind)
-    read = load_model(gltf_files.write_glb(tmp_path / "a.glb", *gltf_files.document(named))).gaussians()
+    read = load(tmp_path, *gltf_files.document(named))
     turned = HALF_TURN @ covariances(splats) @ HALF_TURN
     torch.testing.assert_close(covariances(read), turned, atol=1e-4, rtol=0)
     torch.testing.assert_close(read.opacities, splats.opacities, atol=1 / 500, rtol=0)
@@ -105,7 +108,7 @@ def test_rows_may_lie_apart(tmp_path):
     made["bufferViews"].append({"buffer": 0, "byteOffset": len(data), "byteLength": rows.nbytes, "byteStride": 24})
     for name, offset in {"POSITION": 0, f"{EXTENSION}:SCALE": 12}.items():
         made["accessors"][names[name]] |= {"bufferView": len(made["bufferViews"]) - 1, "byteOffset": offset}
-    assert_moved(load_model(gltf_files.write_glb(tmp_path / "a.glb", made, data + rows.tobytes())).gaussians(), splats, HALF_TURN)
+    assert_moved(load(tmp_path, made, data + rows.tobytes()), splats, HALF_TURN)
 
 
 @pytest.mark.parametrize("inside", [True, False])
@@ -126,7 +129,7 @@ def test_the_drafts_sizes_are_logarithms_and_their_colors_are_called_otherwise(t
     named = gltf_files.attributes(splats)
     named[f"{EXTENSION}:SCALE"] = np.log(named[f"{EXTENSION}:SCALE"])
     made, data = gltf_files.document(named)
-    read = load_model(gltf_files.write_glb(tmp_path / "a.glb", gltf_files.changed(made, *gltf_files.SAID, "colorSpace", to=space), data)).gaussians()
+    read = load(tmp_path, gltf_files.changed(made, *gltf_files.SAID, "colorSpace", to=space), data)
     assert_moved(read, splats, HALF_TURN)
 
 
@@ -138,7 +141,7 @@ def test_the_first_drafts_colors_and_opacities_are_those_of_points(tmp_path):
     colors = np.concatenate([0.5 + 0.28209479177387814 * dc, opacity], axis=1).astype(np.float32)
     sizes = np.log(named[f"{EXTENSION}:SCALE"])
     drafted = {"POSITION": named["POSITION"], "_ROTATION": named[f"{EXTENSION}:ROTATION"], "_SCALE": sizes, "COLOR_0": colors}
-    assert_moved(load_model(gltf_files.write_glb(tmp_path / "a.glb", *gltf_files.document(drafted))).gaussians(), splats, HALF_TURN)
+    assert_moved(load(tmp_path, *gltf_files.document(drafted)), splats, HALF_TURN)
 
 
 def test_one_negative_size_does_not_make_logarithms_of_the_others(tmp_path):
@@ -154,7 +157,7 @@ def test_attributes_for_other_uses_are_not_read(tmp_path):
     made, data = gltf_files.document(gltf_files.attributes(splats))
     made["meshes"][0]["primitives"][0]["attributes"]["NORMAL"] = len(made["accessors"])
     made["accessors"].append({"componentType": 5126, "type": "VEC3", "count": 60})
-    assert_moved(load_model(gltf_files.write_glb(tmp_path / "a.glb", made, data)).gaussians(), splats, HALF_TURN)
+    assert_moved(load(tmp_path, made, data), splats, HALF_TURN)
 
 
 def test_a_zero_quaternion_turns_with_its_node(tmp_path):
@@ -162,8 +165,8 @@ def test_a_zero_quaternion_turns_with_its_node(tmp_path):
     splats.quats[0] = 0
     named = gltf_files.attributes(splats)
     named[f"{EXTENSION}:ROTATION"] = np.nan_to_num(named[f"{EXTENSION}:ROTATION"])
-    made, data = gltf_files.document(named, nodes=[{"mesh": 0, "rotation": CYCLE}])
-    assert_moved(load_model(gltf_files.write_glb(tmp_path / "a.glb", made, data)).gaussians(), splats, HALF_TURN @ CYCLED)
+    read = load(tmp_path, *gltf_files.document(named, nodes=[{"mesh": 0, "rotation": CYCLE}]))
+    assert_moved(read, splats, HALF_TURN @ CYCLED)
 
 
 def test_the_digest_is_of_all_files(tmp_path):
@@ -203,7 +206,7 @@ def test_what_is_written_is_read_again(tmp_path, degree):
 @pytest.mark.parametrize("screen_filter", ["classic", "antialiased"])
 def test_how_splats_are_to_be_drawn_is_written_and_read(tmp_path, screen_filter):
     """As in all other formats; it was lost, and the file taken for one of classic renderers."""
-    model = VanillaModel.from_gaussians(tiny.gaussians(), trained=TrainedScale(screen_filter))
+    model = tiny.model(trained=TrainedScale(screen_filter))
     assert load_model(model.save(tmp_path / "a.glb", provenance={})).trained.screen_filter == screen_filter
 
 

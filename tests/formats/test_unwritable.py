@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from unittest.mock import Mock
 
 import pytest
 import tiny
@@ -24,10 +25,7 @@ WHAT_TO_DO = {
 
 
 def refusing(number):
-    def refuse(*_):
-        raise OSError(number, os.strerror(number))
-
-    return refuse
+    return Mock(side_effect=OSError(number, os.strerror(number)))
 
 
 @pytest.mark.parametrize("number", WHAT_TO_DO)
@@ -65,8 +63,8 @@ def test_trying_leaves_nothing(tmp_path):
 @pytest.mark.parametrize("place", ["refused", "below a file"])
 def test_every_command_that_writes_says_so_before_any_work(tmp_path, monkeypatch, capsys, words, place):
     base = tiny.ply(tmp_path / "base.ply")
-    monkeypatch.setattr("mipmap_plugin.wrap.Wrapped.render", lambda *_, **__: pytest.fail("worked in vain"))
-    monkeypatch.setattr("mipmap_plugin.wrap.Wrapped.adapt", lambda *_, **__: pytest.fail("worked in vain"))
+    for work in ("render", "adapt"):
+        monkeypatch.setattr(f"mipmap_plugin.wrap.Wrapped.{work}", lambda *_, **__: pytest.fail("worked in vain"))
     output = base / "out" if place == "below a file" else tmp_path / "new" / "out"
     if place == "refused":
         monkeypatch.setattr(atomic, "Staging", refusing(errno.EROFS))
@@ -76,10 +74,8 @@ def test_every_command_that_writes_says_so_before_any_work(tmp_path, monkeypatch
 
 
 def test_an_error_that_nobody_foresaw_is_a_sentence(tmp_path, monkeypatch, capsys):
-    def full(*_, **__):
-        raise OSError(errno.ENOSPC, "No space left on device", "/tmp/mipmap-plugin-ab12_x9z/plain.ply")
-
-    monkeypatch.setattr("mipmap_plugin.models.load_model", full)
+    full = OSError(errno.ENOSPC, "No space left on device", "/tmp/mipmap-plugin-ab12_x9z/plain.ply")
+    monkeypatch.setattr("mipmap_plugin.models.load_model", Mock(side_effect=full))
     assert main(["inspect", str(tiny.ply(tmp_path / "base.ply"))]) == 2
     said = capsys.readouterr().err
     assert said.startswith("mipmap-plugin: /tmp/mipmap-plugin-ab12_x9z/plain.ply: No space left on device; check that path")

@@ -3,6 +3,7 @@
 import errno
 import tempfile
 import zipfile
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -36,6 +37,13 @@ def ply(tmp_path):
 def refused(path, sentence):
     with pytest.raises(CheckpointError, match=sentence):
         load_model(path)
+
+
+def spoil_one_row(path):
+    """A NaN in a PLY."""
+    columns = read_ply(path).columns
+    columns["x"][3] = np.nan
+    return write(path, columns)
 
 
 @pytest.mark.parametrize("name", ["scan.ply", "my scan/point_cloud.PLY", "../../etc/out.ply", "/out.ply"])
@@ -75,10 +83,8 @@ def test_a_damaged_archive_is_one_sentence(tmp_path, ply):
 
 
 def test_what_is_doubtful_is_told_by_the_archives_name(tmp_path, ply):
-    columns = read_ply(tmp_path / "own.ply").columns
-    columns["x"][3] = np.nan
     with pytest.warns(UserWarning, match="^the PLY in .*one.zip: 1 of 60 splats was dropped"):
-        load_model(archive(tmp_path / "one.zip", {"a.ply": write(tmp_path / "one.ply", columns).read_bytes()}))
+        load_model(archive(tmp_path / "one.zip", {"a.ply": spoil_one_row(tmp_path / "own.ply").read_bytes()}))
 
 
 def test_a_ply_that_is_no_base_is_told_of_by_the_archives_name(tmp_path, ply):
@@ -152,19 +158,14 @@ def test_of_several_folders_one_has_to_be_given(tmp_path, folder):
 
 
 def test_a_full_disk_is_not_told_as_a_damaged_archive(tmp_path, folder, ply, monkeypatch):
-    def full(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(zipped.shutil, "copyfileobj", full)
+    monkeypatch.setattr(zipped.shutil, "copyfileobj", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
     for path in (packed(tmp_path / "a.zip", folder), archive(tmp_path / "b.zip", {"a.ply": ply})):
         refused(path, f"{path.name} cannot be unpacked in .* \\(No space left on device\\); make room there")
 
 
 def test_what_is_wrong_inside_is_told_by_the_archives_name(tmp_path, folder):
     [splats] = folder.rglob("point_cloud.ply")
-    columns = read_ply(splats).columns
-    columns["x"][3] = np.nan
-    write(splats, columns)
+    spoil_one_row(splats)
     with pytest.warns(UserWarning, match="a.zip/point_cloud/.*1 of 60 splats was dropped"):
         load_model(packed(tmp_path / "a.zip", folder))
     splats.write_bytes(b"ply")
@@ -173,12 +174,10 @@ def test_what_is_wrong_inside_is_told_by_the_archives_name(tmp_path, folder):
 
 @pytest.mark.parametrize("tiles", [[], ["--tiles", "2"]])
 def test_commands_tell_what_is_wrong_by_the_archives_name(tmp_path, folder, capsys, tiles):
-    [splats] = folder.rglob("point_cloud.ply")
-    columns = read_ply(splats).columns
-    columns["x"][3] = np.nan
-    write(splats, columns)
+    spoil_one_row(*folder.rglob("point_cloud.ply"))
     path = packed(tmp_path / "a.zip", folder)
-    wrap_model(folder).adapt(1 / 2, recipe="instant").save(tmp_path / "made")
+    with pytest.warns(UserWarning, match="1 of 60 splats was dropped"):
+        wrap_model(folder).adapt(1 / 2, recipe="instant").save(tmp_path / "made")
     made = packed(tmp_path / "made.zip", tmp_path / "made")
     words = ["--scale", "1/2", "--recipe", "instant", "--output", str(tmp_path / "out"), *tiles]
     assert (main(["adapt", str(path), *words]), main(["adapt", str(made), *words, "--overwrite"])) == (0, 2)

@@ -45,6 +45,19 @@ def rows(draw):
     return {name: float(np.clip(changed.get(name, USUAL.get(name, 0.1)), -3.4e38, 3.4e38)) for name in NAMES}
 
 
+def assert_finite(model, backend, camera, effects):
+    """The image and the gradients of all parameters."""
+    student = model.copy()
+    rendered = get_backend(backend).render(student.gaussians(camera), camera, effects)
+    both = torch.cat([rendered.image, rendered.alpha[..., None]], dim=-1)
+    assert both.isfinite().all(), f"{backend}: the image is not finite"
+    weights = torch.rand(both.shape, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    (both * weights).sum().backward()
+    leaves = {**student.parameters(), **student.shared_parameters()}
+    wrong = [name for name, leaf in leaves.items() if leaf.grad is not None and not leaf.grad.isfinite().all()]
+    assert not wrong, f"{backend}: the gradients of {wrong} are not finite"
+
+
 def check(folder, splats, screen_filter, camera):
     path = ply_files.write(folder / "a.ply", {name: np.array([row[name] for row in splats], np.float32) for name in NAMES})
     try:
@@ -53,14 +66,7 @@ def check(folder, splats, screen_filter, camera):
         assert "\n" not in str(error)
         return
     for name in BACKENDS:
-        student = model.copy()
-        rendered = get_backend(name).render(student.gaussians(camera), camera, Effects(1, screen_filter, near_plane=0.01))
-        both = torch.cat([rendered.image, rendered.alpha[..., None]], dim=-1)
-        assert both.isfinite().all(), f"{name}: the image is not finite"
-        weights = torch.rand(both.shape, generator=torch.Generator().manual_seed(0)) * 2 - 1
-        (both * weights).sum().backward()
-        wrong = [key for key, leaf in student.parameters().items() if leaf.grad is not None and not leaf.grad.isfinite().all()]
-        assert not wrong, f"{name}: the gradients of {wrong} are not finite"
+        assert_finite(model, name, camera, Effects(1, screen_filter, near_plane=0.01))
 
 
 cases = given(splats=st.lists(rows(), min_size=1, max_size=3), screen_filter=st.sampled_from(FILTERS), camera=st.sampled_from(VIEWS))

@@ -14,14 +14,12 @@ import numpy as np
 import ply_files
 import pytest
 import tiny
-import torch
 import torch_checkpoints
 from anchor_checkpoints import Layout
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_any_checkpoint import known, numbers
+from test_any_checkpoint import assert_finite, known, numbers
 
-from mipmap_plugin.backends import get_backend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import MipmapPluginError
 from mipmap_plugin.formats.ply import read_ply
@@ -117,14 +115,7 @@ def check(folder: Path, make: Callable[[Path, list[Change]], Path], changes: lis
         return "refused"
     effects = Effects(1, model.trained.screen_filter, model.trained.eps2d, near_plane=0.01)
     for camera in cameras:
-        student = model.copy()
-        rendered = get_backend("reference").render(student.gaussians(replace(camera, time=0.3)), camera, effects)
-        both = torch.cat([rendered.image, rendered.alpha[..., None]], dim=-1)
-        assert both.isfinite().all(), "the image is not finite"
-        (both * torch.linspace(-1, 2, both.numel()).view_as(both)).sum().backward()
-        leaves = {**student.parameters(), **student.shared_parameters()}
-        wrong = [name for name, leaf in leaves.items() if leaf.grad is not None and not leaf.grad.isfinite().all()]
-        assert not wrong, f"the gradients of {wrong} are not finite"
+        assert_finite(model, "reference", replace(camera, time=0.3), effects)
     return "drawn"
 
 

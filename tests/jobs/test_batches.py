@@ -1,6 +1,7 @@
 """Many checkpoints at many scales by one command: what is skipped, what fails alone, and the lists of them."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -192,6 +193,17 @@ def test_a_list_that_is_no_text(tmp_path):
     (tmp_path / "list").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(SettingsError, match="not a text file"):
         read_list(tmp_path / "list")
+
+
+def test_a_list_may_come_from_a_pipe_of_the_shell_but_not_from_one_that_nobody_may_open(tmp_path):
+    os.mkfifo(tmp_path / "list")
+    with pytest.raises(SettingsError, match="list: a pipe with a name, whose other end nobody may open; --list takes a text file"):
+        read_list(tmp_path / "list")
+    reading, writing = os.pipe()
+    with open(reading), open(writing, "w") as pipe:
+        pipe.write("a.ply\n")
+        pipe.close()
+        assert read_list(Path(f"/dev/fd/{reading}")) == [Path("a.ply")]
 
 
 def test_files_that_adaptations_leave_are_left_out(tmp_path):

@@ -25,8 +25,11 @@ from mipmap_plugin.jobs.run import run
 
 pytest.importorskip("distributed")
 
+from mipmap_plugin.jobs import farm
+
+
 @pytest.fixture
-def farm(tmp_path, monkeypatch):
+def start(tmp_path):
     """Start processes of dask's, a scheduler first; end all of them at the end."""
     environment = saving_often(tmp_path / "site")
     file, started = tmp_path / "scheduler.json", []
@@ -43,20 +46,28 @@ def farm(tmp_path, monkeypatch):
         process.wait()
 
 
-@pytest.mark.slow
-def test_a_killed_worker_loses_one_job_which_is_resumed(farm, tmp_path):
-    from mipmap_plugin.jobs.farm import on_dask
+@pytest.fixture
+def client(monkeypatch):
+    """One of dask's, of which a test says how it submits, and which workers there are."""
+    client = SimpleNamespace(cluster=None, workers={"tcp://a:1": {}}, wait_for_workers=lambda count: None, run=lambda *_, **__: {})
+    client.scheduler_info = lambda n_workers: {"workers": client.workers}
+    monkeypatch.setattr(farm, "_connected", lambda place: nullcontext(client))
+    monkeypatch.setattr(farm, "Event", lambda *_, **__: SimpleNamespace(name="stop", set=lambda: None))
+    return client
 
-    farm("scheduler", "--port", "0", "--no-dashboard")
-    address = json.loads(wait_until(lambda: farm.file.exists() and farm.file.read_text()))["address"]
+
+@pytest.mark.slow
+def test_a_killed_worker_loses_one_job_which_is_resumed(start, tmp_path):
+    start("scheduler", "--port", "0", "--no-dashboard")
+    address = json.loads(wait_until(lambda: start.file.exists() and start.file.read_text()))["address"]
     settings = {"steps": 1500, "seed": 0, "views": "given", "check_every": 5}
     bases = [tiny.folder(tmp_path / f"base_{seed}", tiny.cameras(3), seed=seed) for seed in range(3)]
     jobs = [Job(Base(base, backend="reference"), tmp_path / f"{base.name}.ply", 0.5, recipe="paper", settings=settings) for base in bases]
     with ThreadPoolExecutor(1) as pool:
-        outcomes = pool.submit(lambda: list(on_dask(jobs, address, threads=1)))
-        victim = farm("worker", "--nthreads", "1", "--no-nanny", "--no-dashboard")
+        outcomes = pool.submit(lambda: list(farm.on_dask(jobs, address, threads=1)))
+        victim = start("worker", "--nthreads", "1", "--no-nanny", "--no-dashboard")
         state = wait_until(lambda: next(iter(tmp_path.glob("*.resume")), None))
-        farm("worker", "--nthreads", "1", "--no-nanny", "--no-dashboard")  # later than the other, which therefore has the first job
+        start("worker", "--nthreads", "1", "--no-nanny", "--no-dashboard")  # later than the other, which therefore has the first job
         wait_until(lambda: len(list(tmp_path.glob("*.resume"))) == 2)
         victim.kill()
         saved = load_torch(state)
@@ -71,20 +82,18 @@ def test_a_killed_worker_loses_one_job_which_is_resumed(farm, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_job_that_dask_gives_up_is_handed_out_again(farm, tmp_path):
-    from mipmap_plugin.jobs.farm import on_dask
-
-    farm("scheduler", "--port", "0", "--no-dashboard", DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0")
-    address = json.loads(wait_until(lambda: farm.file.exists() and farm.file.read_text()))["address"]
+def test_a_job_that_dask_gives_up_is_handed_out_again(start, tmp_path):
+    start("scheduler", "--port", "0", "--no-dashboard", DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0")
+    address = json.loads(wait_until(lambda: start.file.exists() and start.file.read_text()))["address"]
     settings = {"steps": 300, "seed": 0, "views": "given", "check_every": 5}
     base = Base(tiny.folder(tmp_path / "base", tiny.cameras(3)), backend="reference")
     job = Job(base, tmp_path / "out.ply", 0.5, recipe="paper", settings=settings)
     with ThreadPoolExecutor(1) as pool:
-        outcomes = pool.submit(lambda: list(on_dask([job], address, threads=1)))
-        victim = farm("worker", "--nthreads", "1", "--no-nanny", "--no-dashboard")
+        outcomes = pool.submit(lambda: list(farm.on_dask([job], address, threads=1)))
+        victim = start("worker", "--nthreads", "1", "--no-nanny", "--no-dashboard")
         wait_until(lambda: next(iter(tmp_path.glob("*.resume")), None))
         victim.kill()
-        farm("worker", "--nthreads", "1", "--no-nanny", "--no-dashboard")
+        start("worker", "--nthreads", "1", "--no-nanny", "--no-dashboard")
         [outcome] = outcomes.result(timeout=300)
     assert outcome.status == "done" and job.target.exists()
 
@@ -100,8 +109,6 @@ def test_workers_of_this_machine(tmp_path, capsys):
 @pytest.mark.slow
 def test_a_worker_that_dies_while_it_starts_is_replaced(monkeypatch):
     from distributed import Nanny
-
-    from mipmap_plugin.jobs import farm
 
     monkeypatch.setattr(farm, "LOOK_S", 0.2)
     monkeypatch.setitem(farm.LOCAL, "distributed.deploy.lost-worker-timeout", "1 s")
@@ -122,39 +129,33 @@ def test_a_worker_that_dies_while_it_starts_is_replaced(monkeypatch):
 
 @pytest.mark.slow
 def test_files_that_are_sent_come_back_adapted(tmp_path):
-    from mipmap_plugin.jobs.farm import on_dask
-
     base = tiny.folder(tmp_path / "base", tiny.cameras(3))
     settings = {"steps": 2, "seed": 0, "views": "given"}
     jobs = [Job(Base(base, backend="reference"), tmp_path / f"{name}.ply", 0.5, settings=settings) for name in ("a", "b", "c", "d", "e")]
-    outcomes = list(on_dask(jobs, "local:2", threads=1, send_files=True))
+    outcomes = list(farm.on_dask(jobs, "local:2", threads=1, send_files=True))
     assert [outcome.status for outcome in outcomes] == ["done"] * 5 and {outcome.file for outcome in outcomes} == {job.target for job in jobs}
     assert len({job.target.read_bytes() for job in jobs}) == 1
     assert jobs[0].target.read_bytes() == run(replace(jobs[0], target=tmp_path / "here.ply")).file.read_bytes()
-    assert [outcome.status for outcome in on_dask(jobs[:1], "local:1", threads=1, send_files=True)] == ["finished before"]
+    assert [outcome.status for outcome in farm.on_dask(jobs[:1], "local:1", threads=1, send_files=True)] == ["finished before"]
 
 
 def test_a_task_is_stopped_where_many_files_are_open(tmp_path, monkeypatch):
     """More than `select` takes: 1024."""
-    from mipmap_plugin.jobs import farm as module
-
     said = iter([False, False])
-    monkeypatch.setattr(module, "Event", lambda name: SimpleNamespace(is_set=lambda: next(said, True)))
-    monkeypatch.setattr(module, "PERIOD_S", 0.01)
+    monkeypatch.setattr(farm, "Event", lambda name: SimpleNamespace(is_set=lambda: next(said, True)))
+    monkeypatch.setattr(farm, "PERIOD_S", 0.01)
     settings = {"steps": 100_000, "views": "given", "patience": None}
     job = Job(Base(tiny.folder(tmp_path / "base", tiny.cameras(3)), backend="reference"), tmp_path / "a.ply", 0.5, settings=settings)
     files = [open(os.devnull) for _ in range(1100)]  # noqa: SIM115
     try:
-        assert module._task(job, 1, "stop").status == "interrupted"
+        assert farm._task(job, 1, "stop").status == "interrupted"
     finally:
-        module._mine.worker.close()
+        farm._mine.worker.close()
         for file in files:
             file.close()
 
 
 def test_a_checkpoint_that_cannot_be_sent_fails_alone(tmp_path):
-    from mipmap_plugin.jobs import farm
-
     good, existing = tiny.folder(tmp_path / "base", tiny.cameras(3)), tmp_path / "existing.ply"
     existing.write_text("here")
     bases = [tmp_path / "nowhere", good, good]
@@ -166,8 +167,6 @@ def test_a_checkpoint_that_cannot_be_sent_fails_alone(tmp_path):
 
 
 def test_that_no_worker_is_there_is_said_once(monkeypatch, capsys):
-    from mipmap_plugin.jobs import farm
-
     looks = []
     client = SimpleNamespace(cluster=None, scheduler_info=lambda n_workers: looks.append(n_workers) or {"workers": {}})
     monkeypatch.setattr(farm, "LOOK_S", 0.001)
@@ -177,11 +176,9 @@ def test_that_no_worker_is_there_is_said_once(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("leave", ["before", "after"])
-def test_ctrl_c_does_not_wait_for_workers_that_are_gone(tmp_path, monkeypatch, leave):
+def test_ctrl_c_does_not_wait_for_workers_that_are_gone(tmp_path, client, monkeypatch, leave):
     """Neither where they left before, nor where they leave without having done what was asked of them."""
-    from mipmap_plugin.jobs import farm
-
-    there, jobs, futures = {"workers": {"tcp://a:1": {}}}, [Job(Base(tmp_path / "base"), tmp_path / "out.ply", 0.5)], []
+    jobs, futures = [Job(Base(tmp_path / "base"), tmp_path / "out.ply", 0.5)], []
 
     class Waiting(Future):  # of the standard library, with what dask's has
         status = "cancelled"
@@ -193,18 +190,13 @@ def test_ctrl_c_does_not_wait_for_workers_that_are_gone(tmp_path, monkeypatch, l
 
     def pressed(pending):
         if not asked:
-            asked.append(there["workers"].clear() if leave == "before" else None)
+            asked.append(client.workers.clear() if leave == "before" else None)
             raise KeyboardInterrupt
-        there["workers"].clear()
+        client.workers.clear()
         return as_completed(pending, timeout=5)
 
     asked: list[object] = []
-    client = SimpleNamespace(
-        cluster=None, scheduler_info=lambda n_workers: there, wait_for_workers=lambda count: None, run=lambda *_, **__: {},
-        submit=lambda *_, **__: futures.append(Waiting()) or futures[-1], cancel=cancel,
-    )  # fmt: skip
-    monkeypatch.setattr(farm, "_connected", lambda place: nullcontext(client))
-    monkeypatch.setattr(farm, "Event", lambda *_, **__: SimpleNamespace(name="stop", set=lambda: None))
+    client.submit, client.cancel = lambda *_, **__: futures.append(Waiting()) or futures[-1], cancel
     monkeypatch.setattr(farm, "as_completed", pressed)
     monkeypatch.setattr(farm, "LOOK_S", 0.01)
     outcomes = []
@@ -213,10 +205,8 @@ def test_ctrl_c_does_not_wait_for_workers_that_are_gone(tmp_path, monkeypatch, l
     assert futures[0].cancelled() and [outcome.status for outcome in outcomes] == ["interrupted"] * (leave == "after")
 
 
-def test_outcomes_that_came_are_not_kept_by_workers(tmp_path, monkeypatch):
+def test_outcomes_that_came_are_not_kept_by_workers(tmp_path, client, monkeypatch):
     """Of jobs that are sent they hold the files that were made, which a worker keeps as long as there is a future."""
-    from mipmap_plugin.jobs import farm
-
     jobs, made, living = [Job(Base(tmp_path / "base"), tmp_path / f"{number}.ply", 0.5) for number in range(6)], [], []
 
     class Done(Future):  # of the standard library, with what dask's has
@@ -228,12 +218,7 @@ def test_outcomes_that_came_are_not_kept_by_workers(tmp_path, monkeypatch):
         living.append(sum(ref() is not None for ref in made))
         return future
 
-    client = SimpleNamespace(
-        cluster=None, scheduler_info=lambda n_workers: {"workers": {"tcp://a:1": {}}}, wait_for_workers=lambda count: None, run=lambda *_, **__: {},
-        submit=submit,
-    )  # fmt: skip
-    monkeypatch.setattr(farm, "_connected", lambda place: nullcontext(client))
-    monkeypatch.setattr(farm, "Event", lambda *_, **__: SimpleNamespace(name="stop", set=lambda: None))
+    client.submit = submit
     monkeypatch.setattr(farm, "as_completed", as_completed)
     monkeypatch.setattr(farm, "_sent", lambda jobs, client: ([], [(job, job) for job in jobs]))
     monkeypatch.setattr(farm, "_outcome", lambda future, job: Outcome(job, "done"))
@@ -243,8 +228,6 @@ def test_outcomes_that_came_are_not_kept_by_workers(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("theirs, told", [("0.0.1", "has mipmap-plugin 0.0.1"), (PackageNotFoundError("mipmap-plugin"), "lacks mipmap-plugin")])
 def test_workers_of_another_version_are_refused(monkeypatch, theirs, told):
-    from mipmap_plugin.jobs import farm
-
     monkeypatch.setattr(farm, "version", lambda name: "0.1.0")
     client = SimpleNamespace(run=lambda *_, **__: {"tcp://a:1": "0.1.0", "tcp://b:2": theirs, "tcp://c:3": OSError("it has left")})
     with pytest.raises(SettingsError, match=f"--dask farm: the worker tcp://b:2 {told}, and this is 0.1.0; install that version there too"):

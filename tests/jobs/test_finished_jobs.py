@@ -1,6 +1,7 @@
 """Which outputs count as finished, and which belong to another request."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import anchor_checkpoints
 import pytest
@@ -155,8 +156,5 @@ def test_a_bug_is_an_outcome_with_its_trace(tmp_path, monkeypatch):
 
 
 def test_out_of_memory_is_one_sentence(tmp_path, monkeypatch):
-    def full(*_, **__):
-        raise MemoryError
-
-    monkeypatch.setattr(Wrapped, "adapt", full)
+    monkeypatch.setattr(Wrapped, "adapt", Mock(side_effect=MemoryError))
     assert run_job(job_of(tmp_path)).reason.startswith("out of memory; use a smaller scale")

@@ -17,8 +17,16 @@ from mipmap_plugin.jobs.finished import finished
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.parcel import do_parcel, pack, unpack
 from mipmap_plugin.jobs.run import run as run_job
+from mipmap_plugin.process.torchvision_absent import torchvision_optional
 from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.tiles.job import TileJob
+
+
+def found_there(job, look):
+    """What a look at a job finds where it has traveled to."""
+    found = []
+    do_parcel(pack(job), lambda job: found.append(look(job)) or Outcome(job, "failed"))
+    return found[0]
 
 
 @pytest.mark.parametrize("given", ["", "transforms_train.json"])
@@ -45,11 +53,12 @@ def test_the_network_of_a_job_travels(tmp_path, monkeypatch):
     """The worker has another folder, where the path of the settings leads nowhere."""
     if importlib.util.find_spec("spandrel") is None:
         pytest.skip("spandrel is in the extra sr")
-    from test_super_resolution import compact
-
+    with torchvision_optional():
+        from spandrel.architectures.Compact.__arch.SRVGG import SRVGGNetCompact
     monkeypatch.setenv("MIPMAP_PLUGIN_CACHE", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
-    torch.save(compact(None).state_dict(), "net.pth")
+    torch.manual_seed(0)
+    torch.save(SRVGGNetCompact(num_feat=8, num_conv=2, upscale=2).state_dict(), "net.pth")
     settings = {"steps": 1, "seed": 0, "views": "given", "upsampler": "net.pth"}
     here = job_of(tmp_path, scale=2.0, settings=settings, network=tmp_path / "net.pth")
     assert run_job(here).status == "done"
@@ -80,28 +89,18 @@ def test_files_that_are_links_travel_as_what_they_are_links_to(tmp_path):
     (scene / "train").symlink_to(disk / "train")
     (scene / "again").symlink_to(scene)
     job = Job(Base(folder), tmp_path / "out", 2.0, images=scene)
-    found = []
-
-    def look(job):
-        found.append((len(job.base.load().cameras), len(job.base.photographs(job.images).images)))
-        return Outcome(job, "failed")
-
-    do_parcel(pack(job), look)
-    assert found == [(3, 4)]
+    assert found_there(job, lambda job: (len(job.base.load().cameras), len(job.base.photographs(job.images).images))) == (3, 4)
 
 
 def test_the_name_of_the_folder_above_a_capture_travels(tmp_path):
     """Deformable 3D Gaussians takes the size and split of a HyperNeRF capture from it."""
     scene = tiny.scene(tmp_path / "vrig-chicken/scene", train=tiny.cameras(1))
     job = replace(job_of(tmp_path, images=scene), base=Base(tmp_path / "base.ply", scene))
-    above = []
 
     def look(job):
-        above.extend(path.parent.name for path in (job.base.cameras, job.images) if (path / "transforms_train.json").is_file())
-        return Outcome(job, "failed")
+        return [path.parent.name for path in (job.base.cameras, job.images) if (path / "transforms_train.json").is_file()]
 
-    do_parcel(pack(job), look)
-    assert above == ["vrig-chicken"] * 2
+    assert found_there(job, look) == ["vrig-chicken"] * 2
 
 
 def test_photographs_outside_the_folder_of_their_list_do_not_travel(tmp_path):
@@ -176,14 +175,7 @@ def test_cameras_that_are_sent_keep_the_image_size_of_their_training(tmp_path, g
     folder, lone = tiny.folder(tmp_path / "base", tiny.cameras(3)), tiny.ply(tmp_path / "lone.ply")
     (folder / "cfg_args").write_text("Namespace(sh_degree=1, resolution=2)")
     job = Job(Base(lone, cameras=folder / given), tmp_path / "out.ply", 0.5)
-    sizes = []
-
-    def look(job):
-        sizes.extend(view.size for view in job.base.load().cameras)
-        return Outcome(job, "failed")
-
-    do_parcel(pack(job), look)
-    assert sizes == [(tiny.HEIGHT // 2, tiny.WIDTH // 2)] * 3
+    assert found_there(job, lambda job: [view.size for view in job.base.load().cameras]) == [(tiny.HEIGHT // 2, tiny.WIDTH // 2)] * 3
 
 
 def test_options_beside_an_exchange_format_are_not_of_its_training(tmp_path):

@@ -3,6 +3,7 @@
 import os
 import shutil
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import tiny
@@ -23,21 +24,25 @@ from mipmap_plugin.wrap import Interrupted
 pytestmark = pytest.mark.usefixtures("brief_ladders", "few_views")
 
 
+def refused(base, asked, state):
+    """These levels are not gone on with."""
+    with pytest.raises(SettingsError, match="holds levels of another base, viewer or settings"):
+        make_levels(base, asked, resume=state)
+
+
 @pytest.mark.parametrize("change", [{"split": "test"}, {"time": 0.5}, {"width": 33}])
 def test_levels_of_other_cameras_are_not_gone_on_with(tmp_path, change):
     base = wrapped()
     make_levels(base, request(coarsest=0.9), tmp_path / "state")
     base.cameras[-1] = replace(base.cameras[-1], **change)
-    with pytest.raises(SettingsError, match="holds levels of another base, viewer or settings"):
-        make_levels(base, request(coarsest=0.9), tmp_path / "state")
+    refused(base, request(coarsest=0.9), tmp_path / "state")
 
 
 def test_levels_of_another_vertical_are_not_gone_on_with(tmp_path):
     base, other = (wrap_model(tiny.model(), up=up) for up in ("z", None))
     asked = request(coarsest=0.9, steps=0, extra_views=2)
     make_levels(base, asked, tmp_path / "state")
-    with pytest.raises(SettingsError, match="holds levels of another base, viewer or settings"):
-        make_levels(other, asked, tmp_path / "state")
+    refused(other, asked, tmp_path / "state")
 
 
 def test_levels_of_another_model_are_not_gone_on_with(tmp_path):
@@ -46,8 +51,7 @@ def test_levels_of_another_model_are_not_gone_on_with(tmp_path):
     with torch.no_grad():
         other.model.parameters()["means"].copy_(first.model.parameters()["means"].flip(0))
     make_levels(first, request(coarsest=0.9), tmp_path / "state")
-    with pytest.raises(SettingsError, match="holds levels of another base, viewer or settings"):
-        make_levels(other, request(coarsest=0.9), tmp_path / "state")
+    refused(other, request(coarsest=0.9), tmp_path / "state")
 
 
 def test_levels_of_a_bound_are_made_again_for_narrower_bands():
@@ -82,12 +86,8 @@ def test_an_interrupted_command_says_that_finished_levels_are_kept(tmp_path, mon
     base = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12), count=12)
     words = ["levels", str(base), "--viewer", "antialiased", "--output", str(tmp_path / "ladder"), "--coarsest", "1/2", "--recipe", "instant"]
     words += ["--views", "given"]
-
-    def ends(*_):
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as first:
-        first.setattr("mipmap_plugin.levels.ladder._curve", ends)
+        first.setattr("mipmap_plugin.levels.ladder._curve", Mock(side_effect=KeyboardInterrupt))
         assert cli.main(words) == 130
         assert f"go on with the levels that {tmp_path / 'ladder.resume'} keeps" in capsys.readouterr().err
     monkeypatch.setattr("mipmap_plugin.wrap.Wrapped.adapt", None)
@@ -101,24 +101,21 @@ def interrupt():
 @pytest.mark.parametrize("by", ["zoom", "distance"])
 def test_a_ladder_that_failed_before_its_first_level_leaves_nothing(tmp_path, monkeypatch, by):
     base = wrapped()
-    monkeypatch.setattr(base, "adapt", lambda *_, **__: interrupt())
+    monkeypatch.setattr(base, "adapt", Mock(side_effect=Interrupted("Ctrl-C")))
     with pytest.raises(Interrupted):
         make_levels(base, request(by=by), resume=tmp_path / "new" / "state")
     assert not (tmp_path / "new").exists()
 
 
 def test_a_first_level_that_is_broken_off_before_its_state_leaves_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr(Run, "start", lambda *_: interrupt())
+    monkeypatch.setattr(Run, "start", Mock(side_effect=Interrupted("Ctrl-C")))
     with pytest.raises(Interrupted):
         make_levels(wrapped(), request(), resume=tmp_path / "new" / "state")
     assert not (tmp_path / "new").exists()
 
 
 def test_a_first_level_whose_state_cannot_be_written_leaves_nothing(tmp_path, monkeypatch):
-    def full(*_):
-        raise OutputError("no space")
-
-    monkeypatch.setattr("mipmap_plugin.adaptation.optimization.resume.save_run", full)
+    monkeypatch.setattr("mipmap_plugin.adaptation.optimization.resume.save_run", Mock(side_effect=OutputError("no space")))
     monkeypatch.setattr("mipmap_plugin.adaptation.session.adapt", lambda run, task, config, on_interrupt, observe: on_interrupt(run))
     with pytest.raises(OutputError, match="no space"):
         make_levels(wrapped(), request(), resume=tmp_path / "new" / "state")
@@ -187,8 +184,7 @@ def test_levels_that_another_run_kept_meanwhile_are_not_mixed_with_these(tmp_pat
         return adapt(scale, **options)
 
     monkeypatch.setattr(base, "adapt", overtaken)
-    with pytest.raises(SettingsError, match="levels of another base, viewer or settings"):
-        make_levels(base, request(), resume=tmp_path / "state")
+    refused(base, request(), tmp_path / "state")
 
 
 def test_a_damaged_unfinished_ladder_is_told(tmp_path):
@@ -209,17 +205,14 @@ def test_levels_of_another_ladder_are_not_taken(tmp_path, monkeypatch):
     monkeypatch.setattr(base, "adapt", lambda scale, **options: adapt(scale, **options) if scale == 1 else interrupt())
     with pytest.raises(Interrupted):
         make_levels(base, request(), resume=tmp_path / "state")
-    with pytest.raises(SettingsError, match="levels of another base, viewer or settings"):
-        make_levels(wrapped(), request(coarsest=1 / 8), resume=tmp_path / "state")
-    with pytest.raises(SettingsError, match="levels of another base, viewer or settings"):
-        make_levels(on_backend(wrapped(), "reference"), request(), resume=tmp_path / "state")
-    (tmp_path / "state" / "request.json").write_text("")
-    with pytest.raises(SceneError, match=r"request\.json: is not JSON"):
-        make_levels(wrapped(), request(), resume=tmp_path / "state")
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "file").write_text("mine")
+    refused(wrapped(), request(coarsest=1 / 8), tmp_path / "state")
+    refused(on_backend(wrapped(), "reference"), request(), tmp_path / "state")
+
+
+def test_a_folder_with_other_things_is_not_taken_for_levels(tmp_path):
+    (tmp_path / "file").write_text("mine")
     with pytest.raises(SettingsError, match="it has other things in it"):
-        make_levels(wrapped(), request(), resume=tmp_path / "other")
+        make_levels(wrapped(), request(), resume=tmp_path)
 
 
 @pytest.mark.parametrize("by", ["zoom", "distance"])
@@ -233,7 +226,7 @@ def test_an_export_that_failed_is_made_by_the_same_command(tmp_path, monkeypatch
     words = ["levels", str(tiny.folder(tmp_path / "base", tiny.cameras(2))), "--viewer", "antialiased", "--coarsest", "1", "--by", "zoom", "--recipe"]
     words += ["instant", "--output", str(tmp_path / "ladder")]
     with monkeypatch.context() as failing:
-        failing.setattr(Exports, "write", lambda *_: (_ for _ in ()).throw(OutputError("the disk is full")))
+        failing.setattr(Exports, "write", Mock(side_effect=OutputError("the disk is full")))
         assert cli.main(words) == 2
     assert "ladder has the levels, and the same command goes on from these" in capsys.readouterr().err
     (tmp_path / "ladder" / ".report.html.0.tmp" / "new").mkdir(parents=True)

@@ -30,6 +30,12 @@ pytestmark = pytest.mark.usefixtures("few_views")
 RULE = DistanceRule(first=0.1, ratio=2.0, count=4)
 
 
+def scene_in(base, ratio=2.0):
+    """As levels down to x1/4 see it."""
+    request = LadderRequest("classic", coarsest=1 / 4, ratio=ratio, by="distance")
+    return scene_of(base, request, request.first_band(base))
+
+
 # The rule
 
 
@@ -179,8 +185,7 @@ def test_finished_levels_are_cut_together_as_they_are_streamed():
 
 def test_walks_are_measured_with_the_chunks_that_are_streamed(small_chunks):
     """Those of the base alone are for making the levels: another one has its splats elsewhere."""
-    base, request = wrapped(), LadderRequest("classic", coarsest=1 / 4, ratio=2.0, by="distance")
-    scene = scene_of(base, request, request.first_band(base))
+    scene = scene_in(base := wrapped())
     levels = [base.model, *[VanillaModel.from_gaussians(scene.splats[:150], base.model.trained)] * (scene.rule.count - 1)]
     streamed = Mixture.streamed(scene.rule, scene.extent, [scene.splats_of(level) for level in levels])
     seen = Walks(scene, levels).seen(scene.views[0], scene.rule.middle(1))
@@ -236,8 +241,7 @@ def test_a_base_that_integrates_over_pixels_is_refused_before_any_work(monkeypat
 
 
 def test_walks_begin_where_something_is_seen(small_chunks, monkeypatch):
-    base, request = wrapped(), LadderRequest("classic", coarsest=1 / 4, ratio=2.0, by="distance")
-    scene = scene_of(base, request, request.first_band(base))
+    scene = scene_in(base := wrapped())
     away = from_x(1e6)
     assert math.isinf(foreground(away, scene.splats.means, scene.target.near_plane))
     monkeypatch.setattr("mipmap_plugin.levels.distance.yardstick.jittered", lambda views, count, generator: [away, views[0]])
@@ -247,8 +251,7 @@ def test_walks_begin_where_something_is_seen(small_chunks, monkeypatch):
 
 def test_a_place_is_measured_once_where_levels_end_before_walks_begin(small_chunks):
     """The nearest parts of this scene are nearer than what most views have before them."""
-    base, request = wrapped(), LadderRequest("classic", coarsest=1 / 4, ratio=1.3, by="distance")
-    scene = scene_of(base, request, request.first_band(base))
+    scene = scene_in(base := wrapped(), ratio=1.3)
     walks = Walks(scene, [base.model] * scene.rule.count)
     pixels = [[walks.seen(view, size).pixel for view in walks.views] for size in walks.places()]
     assert len(walks.places()) < 1 + 2 * scene.rule.count and walks.places()[0] == 0

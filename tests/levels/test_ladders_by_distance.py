@@ -1,13 +1,13 @@
 """Ladders by distance: which levels they keep, what is saved of them, and the command."""
 
 import json
-import re
 from contextlib import nullcontext
 
 import pytest
 import tiny
 import torch
 from levels_by_distance import with_background, wrapped
+from pages_read import record_of
 
 from mipmap_plugin import cli, load_model, wrap_model
 from mipmap_plugin.adaptation.optimization.validation import Validation
@@ -130,8 +130,6 @@ def test_a_level_at_the_end_that_is_the_finer_one_again_is_left_out(tmp_path, sm
 
 
 def test_an_interrupted_ladder_goes_on_with_its_finished_levels(tmp_path, small_chunks, monkeypatch):
-    from mipmap_plugin.levels.distance.level import LevelRun
-
     base, options, made = wrapped(near=100, far=60), dict(by="distance", coarsest=1 / 4, ratio=2.0, resume=tmp_path / "state", **BRIEF), []
     whole = base.levels("classic", **{**options, "resume": tmp_path / "other"})
     run = LevelRun.run
@@ -203,8 +201,7 @@ def test_a_ladder_that_ends_within_its_first_band_has_one_level(tmp_path, capsys
 def test_the_page_of_walks_has_the_figures_of_their_manifest(tmp_path, capsys, command):
     assert cli.main([*command, "--coarsest", "1/4", "--report"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == f"page: {tmp_path / 'out' / 'report.html'}"
-    text, manifest = (tmp_path / "out" / "report.html").read_text(), json.loads((tmp_path / "out" / MANIFEST).read_text())
-    record = json.loads(re.search(r'<script type="application/json" id="record">(.*?)</script>', text, re.DOTALL)[1])
+    record, manifest = record_of(tmp_path / "out" / "report.html"), json.loads((tmp_path / "out" / MANIFEST).read_text())
     assert record["ladder"] == manifest and f"on walks backwards at worst {manifest['worst_db']:.1f} dB" in record["lead"]
     scales = [zoom["scale"] for zoom in record["zooms"]]
     assert scales == sorted(scales) and scales[-1] == 1 and scales[0] < 1 / 2 and len(scales) > 3

@@ -3,13 +3,14 @@
 import gzip
 import json
 import struct
-import sys
 from contextlib import contextmanager
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import tiny
 import torch
+from exchange_files import answer_by
 from two_levels import CHUNKS, LADDER
 
 from mipmap_plugin import cli
@@ -28,8 +29,7 @@ pytestmark = pytest.mark.usefixtures("brief_ladders", "few_views")
 
 # A stand-in for splat-transform: it lists no GPU, writes its arguments to the output, with two chunks, and fails for a file that says that it is
 # broken, or has SH degree 4. Of an SPZ it writes 60 splats of degree 1.
-STAND_IN = """#!{python}
-import gzip, json, pathlib, struct, sys
+STAND_IN = """import gzip, json, pathlib, struct
 if sys.argv[1:] == ["--list-gpus"]:
     sys.exit(print({cards!r}))
 if sys.argv[1:] == ["--version"]:
@@ -55,8 +55,7 @@ def tool(tmp_path, monkeypatch):
     """The only program on the path; it is given the GPUs to list."""
 
     def installed(cards=""):
-        (place / "splat-transform").write_text(STAND_IN.format(python=sys.executable, cards=cards), encoding="utf-8")
-        (place / "splat-transform").chmod(0o755)
+        answer_by(place, STAND_IN.format(cards=cards))
 
     place = tmp_path / "bin"
     place.mkdir()
@@ -225,27 +224,19 @@ def test_a_ladder_that_came_out_as_one_level_is_kept_for_a_command_that_does_not
 @pytest.mark.parametrize("at", ["mipmap_plugin.levels.ladder.write_ladder", "mipmap_plugin.levels.store.LevelStore._loaded"])
 def test_a_disk_that_fills_leaves_the_finished_levels_for_the_same_command(tmp_path, capsys, monkeypatch, at):
     words = made_of_two_levels(tmp_path, "--steps", "1")
-
-    def full(*arguments):
-        raise OutputError("the disk is full")
-
     with monkeypatch.context() as first:
-        first.setattr(at, full)
+        first.setattr(at, Mock(side_effect=OutputError("the disk is full")))
         assert cli.main(words) == 2
     told = f"the disk is full; run the same command again to go on with the levels that {tmp_path / 'ladder.resume'} keeps"
     assert told in capsys.readouterr().err and not (tmp_path / "ladder").exists()
     assert cli.main(words) == 0 and (tmp_path / "ladder" / "level_1.ply").is_file()
 
 
-@pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt, 130), (lambda: OutputError("the disk is full"), 2)], ids=["Ctrl-C", "error"])
+@pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt(), 130), (OutputError("the disk is full"), 2)], ids=["Ctrl-C", "error"])
 def test_an_export_that_ends_early_loses_no_level(tmp_path, tool, capsys, monkeypatch, error, code):
     words = made_of_two_levels(tmp_path, "--steps", "1", "--streamed-sog")
-
-    def ends(*arguments):
-        raise error()
-
     with monkeypatch.context() as first:
-        first.setattr("mipmap_plugin.levels.streamed.write_streamed", ends)
+        first.setattr("mipmap_plugin.levels.streamed.write_streamed", Mock(side_effect=error))
         assert cli.main(words) == code
     assert "the same command goes on" in capsys.readouterr().err
     levels = (tmp_path / "ladder" / "level_1.ply").read_bytes()

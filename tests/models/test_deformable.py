@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from oracle import rotation_one
 
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.backends.reference import ReferenceBackend
@@ -31,16 +32,11 @@ def cross_matrix(v):
     return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
 
 
-def rotation(q):
-    """The matrix that the kernel makes of a quaternion of any length."""
-    w, x, y, z = q
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+def screw(turn, angle, shift, point):
+    """Where the published exponential map carries a point."""
+    k = cross_matrix(turn)
+    turned = np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+    return turned @ point + (angle * np.eye(3) + (1 - np.cos(angle)) * k + (angle - np.sin(angle)) * k @ k) @ shift
 
 
 def oracle(state, xyz, q, log_scale, time):
@@ -58,14 +54,11 @@ def oracle(state, xyz, q, log_scale, time):
     if "branch_w.weight" in w:
         turn, shift = layer("branch_w", h), layer("branch_v", h)
         theta = np.linalg.norm(turn)
-        turn, shift = turn / theta + 1e-5, shift / theta + 1e-5
-        k = cross_matrix(turn)
-        turned = np.eye(3) + np.sin(theta) * k + (1 - np.cos(theta)) * k @ k
-        mean = turned @ xyz + (theta * np.eye(3) + (1 - np.cos(theta)) * k + (theta - np.sin(theta)) * k @ k) @ shift
+        mean = screw(turn / theta + 1e-5, theta, shift / theta + 1e-5, xyz)
     else:
         mean = xyz + layer("gaussian_warp", h)
     scale = np.exp(log_scale) + layer("gaussian_scaling", h)
-    frame = rotation(q / np.linalg.norm(q) + layer("gaussian_rotation", h))
+    frame = rotation_one(torch.from_numpy(q / np.linalg.norm(q) + layer("gaussian_rotation", h))).numpy()  # of a quaternion of any length
     return mean, frame @ np.diag(scale**2) @ frame.T
 
 
@@ -107,10 +100,7 @@ def test_a_screw_without_a_turn_is_a_shift_and_its_gradient_is_finite():
 def test_screws_of_any_angle_follow_the_published_formula(angle):
     axis = np.array([0.48, -0.6, 0.64])
     shift, point = np.array([0.3, -0.2, 0.5]), np.array([1.0, 2.0, -1.0])
-    w, v = axis + 1e-5, shift / angle + 1e-5
-    k = cross_matrix(w)
-    turned = np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
-    expected = turned @ point + (angle * np.eye(3) + (1 - np.cos(angle)) * k + (angle - np.sin(angle)) * k @ k) @ v
+    expected = screw(axis + 1e-5, angle, shift / angle + 1e-5, point)
     moved = move_along_screw(*(torch.tensor(vector, dtype=torch.float64)[None] for vector in (point, angle * axis, shift)))
     np.testing.assert_allclose(moved[0].numpy(), expected, rtol=1e-8, atol=1e-8)
 

@@ -8,31 +8,19 @@ import pytest
 import tiny
 import torch
 from oracle import brute_force
-from torch_checkpoints import aim, gsplat_folder, normalized_by_numpy, splatfacto_folder, splats
+from torch_checkpoints import Hostile, activated, aim, equal, gsplat_folder, normalized_by_numpy, splatfacto_folder, splats
 
 from mipmap_plugin.errors import CheckpointError, OutputExists, SceneError
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.formats.yaml_scalars import read_scalars
-from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.adapted_name import adapted_name
 from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.wrap import wrap_model
 
 NAMES = ["means", "scales", "quats", "opacities", "sh0", "shN"]
-
-
-def equal(model, raw) -> bool:
-    return all(torch.equal(model.parameters()[name], raw[name]) for name in NAMES)
-
-
-def activated(raw) -> Gaussians:
-    """In float64: exp, sigmoid, sh0 before shN; gsplat normalizes quaternions inside."""
-    wide = {name: tensor.double() for name, tensor in raw.items()}
-    sh = torch.cat([wide["sh0"], wide["shN"]], 1)
-    return Gaussians(wide["means"], wide["quats"], wide["scales"].exp(), 1 / (1 + (-wide["opacities"]).exp()), sh)
 
 
 @pytest.mark.parametrize("antialiased", ["true", "false"])
@@ -175,11 +163,6 @@ def test_nothing_is_lost_by_saving(tmp_path):
             model.save(tmp_path / target, provenance={})
     with pytest.raises(OutputExists, match="the base checkpoint itself"):
         model.save(tmp_path / "r", provenance={}, overwrite=True)
-
-
-class Hostile:
-    def __reduce__(self):
-        return print, ("executed",)
 
 
 @pytest.mark.parametrize(

@@ -77,20 +77,6 @@ def test_the_error_for_saga_names_the_file_of_its_scene(tmp_path):
         load_model(write(tmp_path / "contrastive_feature_point_cloud.ply", {**features, **named("f_0", "f_1")}))
 
 
-def test_a_4d_gaussian_splatting_checkpoint_has_its_own_sentence(tmp_path):
-    groups = [{"params": [0], "name": name} for name in ("xyz", "t", "scaling_t", "rotation_r")]
-    torch.save(((3, torch.zeros(2, 3), {"state": {}, "param_groups": groups}), 30_000), tmp_path / "chkpnt_best.pth")
-    with pytest.raises(CheckpointError, match="fudan-zvg"):
-        load_model(tmp_path / "chkpnt_best.pth")
-
-
-def test_a_checkpoint_of_3dgrut_has_its_own_sentence(tmp_path):
-    names = ("positions", "rotation", "scale", "density", "features_albedo", "features_specular")
-    torch.save({name: torch.zeros(2, 3) for name in names} | {"optimizer": {"param_groups": []}}, tmp_path / "ckpt_last.pt")
-    with pytest.raises(CheckpointError, match=r"3DGRUT.*give the PLY that it exports"):
-        load_model(tmp_path / "ckpt_last.pt")
-
-
 def test_a_ply_of_3dgrut_is_read_with_a_note(tmp_path):
     up = {name: np.full(4, value, np.float32) for name, value in {"nx": 0, "ny": 0, "nz": 1}.items()}
     assert any("3DGRUT and MetalSplatter write" in note for note in load_model(write(tmp_path / "a.ply", {**COLUMNS, **up})).notes)
@@ -98,26 +84,34 @@ def test_a_ply_of_3dgrut_is_read_with_a_note(tmp_path):
     assert not any("3DGRUT" in note for note in load_model(write(tmp_path / "b.ply", {**COLUMNS, **askew})).notes)
 
 
-@pytest.mark.parametrize("ending", ["usd", "usda", "usdc", "usdz"])
-def test_usd_has_its_own_sentence(tmp_path, ending):
-    with zipfile.ZipFile(path := tmp_path / f"a.{ending}", "w") as archive:
-        archive.writestr("default.usda", "#usda 1.0")
-    with pytest.raises(CheckpointError, match="is USD, which is not read here; export a PLY"):
-        load_model(path)
+def archive(path, name):
+    with zipfile.ZipFile(path, "w") as held:
+        held.writestr(name, "{}")
 
 
-def test_a_project_of_supersplat_has_its_own_sentence(tmp_path):
-    with zipfile.ZipFile(path := tmp_path / "a.ssproj", "w") as archive:
-        archive.writestr("document.json", "{}")
-        archive.write(write_splats(tmp_path / "splat_0.ply"), "splat_0.ply")
-    with pytest.raises(CheckpointError, match=r"is a project of SuperSplat, .* export a PLY"):
-        load_model(path)
+ADAM = {"state": {}, "param_groups": [{"params": [0], "name": name} for name in ("xyz", "t", "scaling_t", "rotation_r")]}
+OF_3DGRUT = ("positions", "rotation", "scale", "density", "features_albedo", "features_specular")
+OTHERS = {
+    "chkpnt_best.pth": (lambda path: torch.save(((3, torch.zeros(2, 3), ADAM), 30_000), path), "fudan-zvg"),
+    "ckpt_last.pt": (
+        lambda path: torch.save({name: torch.zeros(2, 3) for name in OF_3DGRUT} | {"optimizer": {"param_groups": []}}, path),
+        r"3DGRUT.*give the PLY that it exports",
+    ),
+    **{
+        f"a.{ending}": (lambda path: archive(path, "default.usda"), "is USD, which is not read here; export a PLY")
+        for ending in ("usd", "usda", "usdc", "usdz")
+    },
+    "a.ssproj": (lambda path: archive(path, "document.json"), r"is a project of SuperSplat, .* export a PLY"),
+    "merged.hier": (lambda path: path.write_bytes(bytes(range(7)) * 9), r"Hierarchical 3D Gaussians.*trained_chunks"),
+}
 
 
-def test_a_hierarchy_has_its_own_sentence(tmp_path):
-    (tmp_path / "merged.hier").write_bytes(bytes(range(7)) * 9)
-    with pytest.raises(CheckpointError, match=r"Hierarchical 3D Gaussians.*trained_chunks"):
-        load_model(tmp_path / "merged.hier")
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_file_of_another_project_has_its_own_sentence(tmp_path, name):
+    make, sentence = OTHERS[name]
+    make(tmp_path / name)
+    with pytest.raises(CheckpointError, match=sentence):
+        load_model(tmp_path / name)
 
 
 @pytest.mark.parametrize("place", [".", "meta.json"])

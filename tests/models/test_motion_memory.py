@@ -21,7 +21,7 @@ from mipmap_plugin.models.moving.hexplane import HexPlane
 from mipmap_plugin.models.moving.memory import Memory
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.wrap import wrap_model
+from mipmap_plugin.wrap import Interrupted, wrap_model
 
 best = StartSearch.best  # not a wrapped one
 ALL_ON = "no_do=False, no_dshs=False, static_mlp=True, apply_rotation=True"
@@ -264,11 +264,7 @@ def test_a_resumed_run_comes_to_the_same(tmp_path):
         if step == 8:
             raise KeyboardInterrupt
 
-    state = tmp_path / "state"
-    from mipmap_plugin.adaptation.optimization import resume
-
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(resume, "SAVE_EVERY_S", 0.0)
-        wrap_model(folder).adapt(1 / 2, resume=state, observe=interrupt, **settings)
-    resumed = wrap_model(folder).adapt(1 / 2, resume=state, **settings).model.parameters()
+    with pytest.raises(Interrupted):
+        wrap_model(folder).adapt(1 / 2, resume=tmp_path / "state", observe=interrupt, **settings)
+    resumed = wrap_model(folder).adapt(1 / 2, resume=tmp_path / "state", **settings).model.parameters()
     assert all(torch.equal(resumed[name], tensor) for name, tensor in whole.items())

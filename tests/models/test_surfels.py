@@ -13,7 +13,7 @@ from oracle import color_one
 from samples import camera, gaussians, leaves
 from surfel_checkpoints import columns, folder
 
-from mipmap_plugin.adaptation.start.surfel_form import visible_area
+from mipmap_plugin.adaptation.start.surfel_form import visible_area, widened_for_slant
 from mipmap_plugin.backends import choose_backend, survey
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.reference import ReferenceBackend
@@ -169,6 +169,12 @@ def test_the_area_is_that_of_the_larger_of_both(axes):
     entries = (spread[i, j].reshape(1) for i, j in ((0, 0), (0, 1), (1, 1)))
     shown = Projected(torch.zeros(1, 2), torch.ones(1), *entries, torch.tensor([a * a * b * b]))
     assert float(2 * math.pi * visible_area(shown, 0.5)) == pytest.approx(float(torch.exp(-squared / 2).sum()) * cell, rel=1e-3)
+
+
+def test_a_surfel_grows_for_slant_along_what_the_filter_widened_and_to_at_most_twice_its_area():
+    own, wide = torch.tensor([[1.0, 0.1, 0.0], [0.1, 0.1, 0.0], [1.0, 1.0, 0.0]]), torch.tensor([[1.0, 0.5, 0.0], [0.5, 0.5, 0.0], [1.0, 1.0, 0.0]])
+    grown = widened_for_slant(own, wide, torch.tensor([1.5, 9.0, 9.0]))
+    torch.testing.assert_close(grown, torch.tensor([[1.0, 0.75, 0.0], [0.5 * 2**0.5, 0.5 * 2**0.5, 0.0], [1.0, 1.0, 0.0]]))
 
 
 def test_a_checkpoint_is_read_as_it_is(tmp_path):

@@ -210,25 +210,13 @@ def test_adapt_writes_no_page_unless_asked(model_folder, tmp_path):
 
 def test_the_page_of_a_tradeoff_has_the_points_of_its_json(model_folder, tmp_path, capsys):
     folder = tmp_path / "results"
-    words = [
-        "tradeoff",
-        model_folder,
-        "--scale",
-        "1/2",
-        "--output",
-        folder,
-        "--recipe",
-        "instant",
-        "--repeats",
-        "1",
-        "--no-renderers",
-        "--no-picture",
-    ]
-    assert main([str(word) for word in (*words, "--views", "1", "--no-picture", "--report")]) == 0
+    words = ["tradeoff", str(model_folder), "--scale", "1/2", "--output", str(folder), "--recipe", "instant", "--report"]
+    words += ["--repeats", "1", "--views", "1", "--no-renderers", "--no-picture"]
+    assert main(words) == 0
     record, written = record_of(folder / "report.html"), json.loads((folder / "tradeoff.json").read_text())
     assert record["tradeoffs"] == written["scales"] and record["provenance"] == written["machine"]
     assert capsys.readouterr().out.splitlines()[-1] == f"page: {folder / 'report.html'}"
-    assert main([str(word) for word in (*words, "--no-picture", "--report")]) == 2
+    assert main(words) == 2
 
 
 def test_the_page_of_levels_has_the_figures_of_their_manifest(model_folder, tmp_path, capsys):
@@ -253,16 +241,14 @@ def test_the_page_of_levels_has_the_figures_of_their_manifest(model_folder, tmp_
     assert f"at worst {manifest['worst_db']:.1f} dB" in record["lead"]
 
 
-def test_the_lead_of_a_ladder_counts_its_levels():
-    level, curve = dict(splats=1000, bytes=2_000_000), [dict(base_db=20.0)]
-    facts = dict(viewer="classic", curve=curve, worst_db=20.0, mean_db=21.0)
-    assert lead(dict(facts, levels=[level]), "at any zoom").startswith("1 level for classic, 1,000 splats, 2.0 MB: at any zoom at worst 20.0 dB")
-    assert lead(dict(facts, levels=[level, level]), "at any zoom").startswith("2 levels for classic, 2,000 splats, 4.0 MB")
-
-
-def test_the_lead_of_a_tiny_ladder_has_a_size_and_a_splat():
-    facts = dict(viewer="classic", curve=[dict(base_db=20.0)], worst_db=20.0, mean_db=21.0, levels=[dict(splats=1, bytes=2790)])
-    assert lead(facts, "at any zoom").startswith("1 level for classic, 1 splat, 3 kB: ")
+@pytest.mark.parametrize(
+    ("levels", "splats", "size", "told"),
+    [(1, 1000, 2_000_000, "1 level for classic, 1,000 splats, 2.0 MB"), (2, 1000, 2_000_000, "2 levels for classic, 2,000 splats, 4.0 MB"),
+     (1, 1, 2790, "1 level for classic, 1 splat, 3 kB")],
+)  # fmt: skip
+def test_the_lead_of_a_ladder_counts_its_levels_splats_and_bytes(levels, splats, size, told):
+    facts = dict(viewer="classic", curve=[dict(base_db=20.0)], worst_db=20.0, mean_db=21.0, levels=[dict(splats=splats, bytes=size)] * levels)
+    assert lead(facts, "at any zoom").startswith(f"{told}: at any zoom at worst 20.0 dB")
 
 
 def test_zooming_in_is_compared_with_the_base_after_shrinking(model_folder):

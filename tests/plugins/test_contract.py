@@ -1,36 +1,19 @@
-"""What a family or a backend of a stranger breaks is told in a sentence that names it, most of it before any work."""
+"""What a family of a stranger breaks is told in a sentence that names it, most of it before any work."""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import tiny
 import torch
+from their_families import BRIEF, Ellipsoids, Theirs, model, save_as_text, wrapped
 
-from mipmap_plugin import load_model, register_backend, register_model, register_recipe, wrap_model
-from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin import load_model, register_model, wrap_model
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
-from mipmap_plugin.formats.atomic import new_file
 from mipmap_plugin.models import API_VERSION, CERTAIN, Family, Match, TrainedScale, Traits
 from mipmap_plugin.models.contract import lacking
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
-from mipmap_plugin.splatting.rotations import rotations
-
-BRIEF = dict(steps=1, extra_views=2, validation_views=2)
-
-
-class Theirs(VanillaModel):
-    family = "theirs"
-
-
-def model(**members):
-    return type("Odd", (Theirs,), members)(tiny.model().parameters())
-
-
-def wrapped(**members):
-    return wrap_model(model(**members), cameras=tiny.cameras(2))
 
 
 def parameters(**changes):
@@ -79,16 +62,6 @@ def test_parameters_that_fail_are_told_by_name():
         wrapped(parameters=lambda self: 1 / 0)
 
 
-def without_a_color(self, camera=None):
-    splats = VanillaModel.gaussians(self, camera)
-    return replace(splats, sh=splats.sh[1:])
-
-
-def with_a_root_of_0(self, camera=None):
-    splats = VanillaModel.gaussians(self, camera)
-    return replace(splats, means=splats.means + (splats.means - splats.means.detach()).norm(dim=1, keepdim=True).sqrt())
-
-
 class Tinted(Theirs):
     """Its colors have a factor that all splats share."""
 
@@ -114,15 +87,6 @@ class Counting(Tinted):
         with torch.no_grad():
             self.tint.mul_(0.999)
         return super().gaussians(camera)
-
-
-class Ellipsoids(Theirs):
-    """Its splats are told by covariances."""
-
-    def gaussians(self, camera=None):
-        splats = super().gaussians(camera)
-        axes = rotations(splats.quats) * splats.scales[:, None, :]
-        return replace(splats, covariances=axes @ axes.mT)
 
 
 def test_splats_of_covariances_are_merged():
@@ -161,30 +125,8 @@ def test_parameters_that_all_rows_share_are_looked_at_too():
         wrap_model(Leafless(raw), cameras=views).adapt(0.25, **BRIEF)
 
 
-@pytest.mark.parametrize(
-    ("members", "said"),
-    [
-        (dict(gaussians=without_a_color), r"gaussians\(\) returned splats that do not fit together: sh: expected .* got \[59, 4, 3\]"),
-        (dict(gaussians=with_a_root_of_0), r"gaussians\(\) has gradients with NaN or infinity in means;"),
-        (dict(copy=lambda self: None), r"copy\(\) returned a NoneType, which lacks traits, "),
-        (dict(row_opacities=lambda self, views=(): torch.full((60,), torch.nan)), r"row_opacities\(\) .* returned a tensor \[60\], not all finite"),
-        (dict(rebuild=lambda self, form: None), r"rebuild\(form\) has to hold the splats that `form` returns; it called it 0 times"),
-        (dict(rebuild=lambda self, form: form(self.gaussians()) and None), r"rebuild\(form\) .*; it holds 60 splats after it returned \d+"),
-    ],
-)
-def test_what_a_family_returns_wrong_is_told_by_its_name(members, said):
-    with pytest.raises(PluginError, match=f"family 'theirs': {said}"):
-        wrapped(**members).adapt(0.25, **BRIEF)
-
-
 def save_elsewhere(self, path, *, provenance, overwrite=False):
     return Path(path).with_name("elsewhere.ply")
-
-
-def save_as_text(self, path, *, provenance, overwrite=False):
-    with new_file(path, overwrite) as temporary:
-        temporary.write_text("splats")
-    return path
 
 
 @pytest.mark.parametrize(
@@ -222,39 +164,7 @@ def test_a_model_is_called_as_its_family(tmp_path):
         load_model(registered(tmp_path / "a.own", lambda path, iteration: type("Nameless", (VanillaModel,), {})(tiny.model().parameters())))
 
 
-def test_a_loader_that_ends_the_process_is_told_by_name(tmp_path):
-    with pytest.raises(PluginError, match=r"family 'theirs' cannot load .*: SystemExit: 0"):
-        load_model(registered(tmp_path / "a.own", lambda path, iteration: sys.exit(0)))
-
-
 def test_an_ending_without_its_dot_is_told(tmp_path):
     file = registered(tmp_path / "a.own", saves="own")
     with pytest.raises(CheckpointError, match=r"the family 'theirs' failed: .*`saves` must be the ending of a file's name, such as \.ply, got 'own'"):
         load_model(file)
-
-
-def test_a_recipe_that_ends_the_process_is_told_by_name():
-    register_recipe("theirs", lambda scale, network: sys.exit(0))
-    with pytest.raises(PluginError, match=r"recipe 'theirs' failed at x0\.5: SystemExit: 0"):
-        wrapped().adapt(0.5, recipe="theirs")
-
-
-@pytest.mark.parametrize(
-    ("members", "said"),
-    [
-        (dict(lacking=lambda self, needs: "no"), r"lacking\(\) has to return a list of sentences; it returned a str"),
-        (
-            dict(render=lambda self, *shot: (drawn := ReferenceBackend.render(self, *shot)).replaced(image=drawn.image.detach().numpy())),
-            "has to return a Rendered with an image .*; it returned a ndarray",
-        ),
-        (dict(render=lambda self, *shot: ReferenceBackend.render(self, *shot).image), r"has to return a Rendered with an image \[24, 32, 3\]"),
-        (
-            dict(render=lambda self, *shot: (drawn := ReferenceBackend.render(self, *shot)).replaced(image=drawn.image.movedim(2, 0))),
-            r"has to return a Rendered with an image \[24, 32, 3\]",
-        ),
-    ],
-)
-def test_what_a_backend_returns_wrong_is_told_by_its_name(members, said):
-    register_backend("odd", type("Odd", (ReferenceBackend,), {"name": "odd", **members}))
-    with pytest.raises(PluginError, match=f"backend 'odd':? {said}"):
-        (base := wrap_model(tiny.model(), cameras=tiny.cameras(2), backend="odd")).render(base.cameras[0])

@@ -5,24 +5,16 @@ from dataclasses import replace
 import pytest
 import tiny
 import torch
+from their_families import BRIEF, Theirs, wrapped
 
 from mipmap_plugin import load_model, register_model, wrap_model
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.errors import OutputExists, PluginError
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models import API_VERSION, CERTAIN, Family, Match, detect
+from mipmap_plugin.models import API_VERSION, CERTAIN, Family, Match
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.plugin_errors import naming_any
 from mipmap_plugin.splatting.rotations import rotations
-
-BRIEF = dict(steps=1, extra_views=2, validation_views=2, merge_to=1.0)
-
-
-def family(**methods):
-    """A wrapped model of a third-party family."""
-    theirs = type("Theirs", (VanillaModel,), {"family": "theirs", **methods})
-    model = theirs(tiny.model().parameters())
-    return wrap_model(model, cameras=tiny.cameras(2), backend="reference")
 
 
 def with_nan(method):
@@ -73,15 +65,25 @@ def with_covariances(made):
 )
 def test_what_a_family_does_wrong_is_told_by_its_name(gaussians, said):
     with pytest.raises(PluginError, match=said):
-        base = family(gaussians=gaussians)
+        base = wrapped(gaussians=gaussians)
         base.render(base.cameras[0])
     with pytest.raises(PluginError, match=said):
-        family(gaussians=gaussians).adapt(0.5, **BRIEF)
+        wrapped(gaussians=gaussians).adapt(0.5, **BRIEF)
 
 
 def opaque(self, camera=None):
     splats = VanillaModel.gaussians(self, camera)
     return replace(splats, opacities=3 * splats.opacities)
+
+
+def without_a_color(self, camera=None):
+    splats = VanillaModel.gaussians(self, camera)
+    return replace(splats, sh=splats.sh[1:])
+
+
+def with_a_root_of_0(self, camera=None):
+    splats = VanillaModel.gaussians(self, camera)
+    return replace(splats, means=splats.means + (splats.means - splats.means.detach()).norm(dim=1, keepdim=True).sqrt())
 
 
 def detached(self, camera=None):
@@ -99,17 +101,23 @@ def frozen(self):
         (dict(copy=lambda self: type(self)(self.parameters())), r"family 'theirs': copy\(\) shares means, .*; clone the tensors"),
         (dict(copy=frozen), r"family 'theirs': copy\(\) has to return parameters that are leaves and require gradients; means, .* cannot"),
         (dict(gaussians=detached), r"family 'theirs': gaussians\(\) returned splats without gradients"),
+        (dict(copy=lambda self: None), r"family 'theirs': copy\(\) returned a NoneType, which lacks traits, "),
+        (dict(gaussians=without_a_color), r"'theirs': gaussians\(\) returned splats that do not fit together: sh: expected .* got \[59, 4, 3\]"),
+        (dict(gaussians=with_a_root_of_0), r"family 'theirs': gaussians\(\) has gradients with NaN or infinity in means;"),
         (dict(gaussians=opaque), r"family 'theirs': gaussians\(\) returned opacities from 1\.03 to 2\.84, which have to lie in 0\.\.1"),
         (with_nan("reshape"), r"family 'theirs': reshape\(form, views\) left NaN in scales; keep what it divides by"),
         (with_nan("rebuild"), r"family 'theirs': rebuild\(form\) left NaN in scales"),
         (dict(row_opacities=lambda self, views=(): torch.ones(3)), r"row_opacities\(\) has to return 60 finite num.*; it returned a tensor \[3\]"),
+        (dict(row_opacities=lambda self, views=(): torch.full((60,), torch.nan)), r"row_opacities\(\) .* returned a tensor \[60\], not all finite"),
+        (dict(rebuild=lambda self, form: None), r"rebuild\(form\) has to hold the splats that `form` returns; it called it 0 times"),
+        (dict(rebuild=lambda self, form: form(self.gaussians()) and None), r"rebuild\(form\) .*; it holds 60 splats after it returned \d+"),
         (dict(row_opacities=lambda self, views=(): None), r"row_opacities\(\) has to return 60 finite numbers.*; it returned a NoneType"),
         (dict(__module__="__main__", rebuild=lambda self, form: {}["zz"]), "family 'theirs' failed: KeyError: 'zz'"),  # of a script; a copy's method
     ],
 )
 def test_a_family_that_breaks_its_contract_is_told_before_the_base_changes(methods, said):
-    theirs = type("Theirs", (VanillaModel,), {"family": "theirs", **methods})
-    model = theirs({name: tensor.clone().requires_grad_() for name, tensor in tiny.model().parameters().items()})
+    raw = {name: tensor.clone().requires_grad_() for name, tensor in tiny.model().parameters().items()}
+    model = type("Odd", (Theirs,), methods)(raw)
     before = {name: tensor.detach().clone() for name, tensor in model.parameters().items()}
     with pytest.raises(PluginError, match=said):
         wrap_model(model, cameras=tiny.cameras(2), backend="reference").adapt(0.5, steps=3, extra_views=2, validation_views=2)
@@ -117,7 +125,7 @@ def test_a_family_that_breaks_its_contract_is_told_before_the_base_changes(metho
 
 
 def test_splats_without_gradients_may_be_adapted_without_steps():
-    assert family(gaussians=detached).adapt(0.5, recipe="instant", merge_to=1.0).report.gaussians_after == 60
+    assert wrapped(gaussians=detached).adapt(0.5, recipe="instant", merge_to=1.0).report.gaussians_after == 60
 
 
 def without_room(self, path, *, overwrite, networks_move=False):
@@ -126,7 +134,7 @@ def without_room(self, path, *, overwrite, networks_move=False):
 
 def test_a_family_that_fails_before_the_work_begins_is_told_by_its_name(tmp_path):
     with pytest.raises(PluginError, match="family 'theirs' failed: KeyError: 'room'"):
-        family(refuse_output=without_room).refuse_output(tmp_path / "new.ply", overwrite=False)
+        wrapped(refuse_output=without_room).refuse_output(tmp_path / "new.ply", overwrite=False)
 
 
 def half_doubles(self, form, views=()):
@@ -136,7 +144,7 @@ def half_doubles(self, form, views=()):
 
 def test_shapes_that_a_family_mixes_up_are_told_by_its_name():
     with pytest.raises(PluginError, match="family 'theirs' failed: ShapeError: quats: "):
-        family(reshape=half_doubles).adapt(0.5, recipe="instant")
+        wrapped(reshape=half_doubles).adapt(0.5, recipe="instant")
 
 
 def test_a_family_that_does_not_say_what_it_wrote_is_told(tmp_path):
@@ -144,14 +152,14 @@ def test_a_family_that_does_not_say_what_it_wrote_is_told(tmp_path):
         VanillaModel.save(self, path, provenance=provenance, overwrite=overwrite)
 
     with pytest.raises(PluginError, match=r"family 'theirs': save\(\) has to return the path .* returned a NoneType, so that .*new\.ply is left"):
-        family(save=save).adapt(0.5, recipe="instant").save(tmp_path / "new.ply")
+        wrapped(save=save).adapt(0.5, recipe="instant").save(tmp_path / "new.ply")
 
 
 def test_a_family_that_ignores_what_is_there_replaces_nothing(tmp_path):
     def save(self, path, *, provenance, overwrite=False):
         return VanillaModel.save(self, path, provenance=provenance, overwrite=True)
 
-    adapted = family(save=save).adapt(0.5, recipe="instant")
+    adapted = wrapped(save=save).adapt(0.5, recipe="instant")
     (tmp_path / "new.ply").write_text("precious")
     with pytest.raises(OutputExists):
         adapted.save(tmp_path / "new.ply")
@@ -168,16 +176,3 @@ def test_a_loader_that_returns_no_model_is_told_what_to_return(tmp_path, loaded,
     register_model("theirs", Family("theirs", "Theirs", lambda files: Match(CERTAIN, "all"), API_VERSION, lambda path, *, iteration=None: loaded))
     with pytest.raises(PluginError, match=f"family 'theirs': its load has to return an object with .*; it returned {said}$"):
         load_model(tiny.ply(tmp_path / "a.ply"))
-
-
-def damaged(files):
-    from mipmap_plugin.errors import CheckpointError
-
-    raise CheckpointError("this is no .theirs file")
-
-
-def test_a_family_that_raises_while_it_recognizes_breaks_no_other(tmp_path):
-    register_model("theirs", Family("theirs", "Theirs", damaged, API_VERSION))
-    for path in (tiny.folder(tmp_path / "base"), tiny.ply(tmp_path / "base.ply")):
-        found = detect(path)
-        assert found.family == "3dgs" and found.notes == ("the family 'theirs' failed: this is no .theirs file",)

@@ -11,7 +11,7 @@ import pytest
 import surfel_checkpoints
 import tiny
 import torch_checkpoints
-from test_contract import Ellipsoids, Theirs, save_as_text, wrapped
+from their_families import Ellipsoids, Theirs, save_as_text, wrapped
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.errors import PluginError

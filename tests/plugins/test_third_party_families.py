@@ -1,6 +1,7 @@
 """Third-party families: recognized beside the built-in ones, and a broken one breaks nothing."""
 
 import runpy
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
 from mipmap_plugin.models import API_VERSION, CERTAIN, PLAIN, Family, Match, Traits, contract, detect
 from mipmap_plugin.models.adapted_name import adapted_name
 from mipmap_plugin.models.conformance import ModelSuite
-from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family
+from mipmap_plugin.models.families import BUILT_IN, find_family
 from mipmap_plugin.models.reading import load_vanilla
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import write_cameras
@@ -188,6 +189,13 @@ def test_a_place_that_another_family_shares_is_no_claim(tmp_path):
     assert detect(tmp_path / "run").family == "gsplat"
 
 
+def damaged(files):
+    raise CheckpointError("this is no .mine file")
+
+
+WRONG = ("high", 2.0, -1, float("nan"))
+
+
 @pytest.mark.parametrize(
     ("target", "reason"),
     [
@@ -197,13 +205,16 @@ def test_a_place_that_another_family_shares_is_no_claim(tmp_path):
         (custom_family(api_version=API_VERSION + 1), f"is written for API version {API_VERSION + 1}, but this package has API version {API_VERSION}"),
         (custom_family(recognize=lambda files: files.nothing), "has no attribute 'nothing'"),
         (custom_family(recognize=lambda files: True), "its recognize returns a bool; it has to be a Match or None"),
+        (custom_family(recognize=damaged), "'mine' failed: this is no .mine file"),
+        *((custom_family(recognize=lambda files, sure=sure: Match(sure, "I say so")), "sure must be a number from 0 to 1") for sure in WRONG),
         (custom_family(before="3dgs"), "`before` must be a tuple of names, got '3dgs'"),
     ],
 )
 def test_a_broken_family_is_reported_and_breaks_nothing(tmp_path, target, reason):
     register_model("mine", target)
-    checkpoint = detect(ply(tmp_path / "a.ply"))
-    assert checkpoint.family == "3dgs" and "the family 'mine' failed" in checkpoint.notes[0] and reason in checkpoint.notes[0]
+    for path in (tiny.folder(tmp_path / "base"), ply(tmp_path / "a.ply")):
+        checkpoint = detect(path)
+        assert checkpoint.family == "3dgs" and "the family 'mine' failed" in checkpoint.notes[0] and reason in checkpoint.notes[0]
     assert wrap_model(checkpoint.path).model.family == "3dgs"
     with pytest.raises(CheckpointError, match="the family 'mine' failed"):
         detect(ply_files.write(tmp_path / "points.ply", {name: np.zeros(2, np.float32) for name in "xyz"}))
@@ -222,20 +233,29 @@ def test_families_that_exclude_one_another_are_named(tmp_path):
         detect(ply(tmp_path / "a.ply", "mine"))
 
 
-def test_a_loader_that_fails_or_reads_its_own_family_alone_says_so(tmp_path):
-    path = ply(tmp_path / "a.ply", "mine")
-    register_model("mine", custom_family(load=lambda path, iteration: {}["means"]))
-    with pytest.raises(PluginError, match=r"family 'mine' cannot load .*a\.ply: KeyError: 'means'"):
-        load_model(path)
-    register_model("mine", custom_family(), replace=True)
-    with pytest.raises(CheckpointError, match=r"a\.ply is a checkpoint of My splats, which is read in another way; load it with load_model"):
-        load_vanilla(path)
+def lost(path, iteration):
+    raise FileNotFoundError("its network")
 
 
-def test_a_loader_that_cannot_be_imported(tmp_path):
-    register_model("mine", custom_family(load="no_such_module:load"))
-    with pytest.raises(PluginError, match="no_such_module"):
+@pytest.mark.parametrize(
+    ("load", "said"),
+    [
+        (lambda path, iteration: {}["means"], "KeyError: 'means'"),
+        (lambda path, iteration: sys.exit(0), "SystemExit: 0"),
+        (lost, "FileNotFoundError: its network"),
+        ("no_such_module:load", "ModuleNotFoundError: No module named 'no_such_module'"),
+    ],
+)
+def test_a_loader_that_fails_is_told_by_its_name(tmp_path, load, said):
+    register_model("mine", custom_family(load=load))
+    with pytest.raises(PluginError, match=f"'mine' .*cannot .*: {said}"):
         load_model(ply(tmp_path / "a.ply", "mine"))
+
+
+def test_a_loader_of_another_family_says_that_it_is_one(tmp_path):
+    register_model("mine", custom_family())
+    with pytest.raises(CheckpointError, match=r"a\.ply is a checkpoint of My splats, which is read in another way; load it with load_model"):
+        load_vanilla(ply(tmp_path / "a.ply", "mine"))
 
 
 def test_what_a_loaded_model_lacks_is_named(tmp_path):
@@ -270,23 +290,3 @@ def test_wrong_names_of_parameters_are_one_sentence(renamed, message):
 
     with pytest.raises(SettingsError, match=message):
         wrap_model(Renamed(tiny.model(4).parameters()))
-
-
-@pytest.mark.parametrize("sure", ["high", 2.0, -1, float("nan")])
-def test_a_certainty_out_of_range_is_a_failure_of_its_family_alone(tmp_path, sure):
-    ply = tiny.ply(tmp_path / "a.ply")
-    with FAMILIES.temporarily(bold=Family("bold", "Bold", lambda files: Match(sure, "I say so"), API_VERSION)):
-        found = detect(ply)
-    assert found.family == "3dgs" and "'bold' failed: sure must be a number from 0 to 1" in found.notes[0]
-
-
-def test_a_loader_that_finds_no_file_is_a_broken_plug_in(tmp_path):
-    def load(path, *, iteration=None):
-        raise FileNotFoundError("its network")
-
-    ply = tiny.ply(tmp_path / "a.ply")
-    with (
-        FAMILIES.temporarily(bold=Family("bold", "Bold", lambda files: Match(CERTAIN, "all"), API_VERSION, load)),
-        pytest.raises(PluginError, match=r"family 'bold' cannot load .* FileNotFoundError: its network"),
-    ):
-        load_model(ply)

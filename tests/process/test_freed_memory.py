@@ -11,20 +11,26 @@ import pytest
 
 from mipmap_plugin.process.freed_memory import keep_freed_memory, return_freed_memory
 
-# Fills and frees 120 MiB again and again, in blocks of 24 MiB as tensors have them, and prints the page faults of that.
-FAULTS_OF_BLOCKS = """
-import ctypes, resource, sys
+# Blocks of memory as tensors have them.
+BLOCKS = """
+import ctypes, re, resource, sys
 from mipmap_plugin.process.freed_memory import keep_freed_memory, return_freed_memory
-if sys.argv[1:]:
-    assert keep_freed_memory()
-libc, size = ctypes.CDLL(None), 24 << 20
+libc = ctypes.CDLL(None)
 libc.malloc.restype, libc.malloc.argtypes, libc.free.argtypes = ctypes.c_void_p, [ctypes.c_size_t], [ctypes.c_void_p]
 libc.memset.argtypes = [ctypes.c_void_p, ctypes.c_int, ctypes.c_size_t]
-def fill_and_free():
-    blocks = [libc.malloc(size) for _ in range(5)]
+def filled(count, size):
+    blocks = [libc.malloc(size) for _ in range(count)]
     for block in blocks:
         libc.memset(block, 1, size)
-    for block in blocks:
+    return blocks
+"""
+
+# Fills and frees 120 MiB again and again, and prints the page faults of that.
+FAULTS_OF_BLOCKS = BLOCKS + """
+if sys.argv[1:]:
+    assert keep_freed_memory()
+def fill_and_free():
+    for block in filled(5, 24 << 20):
         libc.free(block)
 for _ in range(5):
     fill_and_free()
@@ -42,22 +48,10 @@ def test_freed_memory_is_kept():
     assert kept < without / 4
 
 
-def test_without_glibc_nothing_is_set(monkeypatch):
-    monkeypatch.setattr(platform, "libc_ver", lambda: ("", ""))
-    assert not keep_freed_memory()
-
-
 # Frees 90 MiB below a block that stays, as the arrays of a phase, and prints what the process holds before and after giving it back, in MiB.
-RETURNED = """
-import ctypes, re
-from mipmap_plugin.process.freed_memory import keep_freed_memory, return_freed_memory
+RETURNED = BLOCKS + """
 assert keep_freed_memory()
-libc, size = ctypes.CDLL(None), 30 << 20
-libc.malloc.restype, libc.malloc.argtypes, libc.free.argtypes = ctypes.c_void_p, [ctypes.c_size_t], [ctypes.c_void_p]
-libc.memset.argtypes = [ctypes.c_void_p, ctypes.c_int, ctypes.c_size_t]
-blocks = [libc.malloc(size) for _ in range(4)]
-for block in blocks:
-    libc.memset(block, 1, size)
+blocks = filled(4, 30 << 20)
 for block in blocks[:3]:
     libc.free(block)
 held = lambda: int(re.search(r"VmRSS:\\s+(\\d+)", open("/proc/self/status").read())[1]) // 1024

@@ -5,6 +5,7 @@ import signal
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 
 import pytest
 import tiny
@@ -61,10 +62,15 @@ def test_torch_has_one_thread_only_beside_kernels_with_threads_of_their_own(back
     assert set(seen) == {(1, 3) if backend == "cpu" else (3, 1)} and torch.get_num_threads() == before
 
 
-def in_a_thread(function):
-    """What a function returns in a thread of its own."""
-    with ThreadPoolExecutor(1) as pool:
-        return pool.submit(function).result()
+@contextmanager
+def torch_has(count):
+    """So many threads within, and what it had before afterwards."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_threads_that_adapt_at_once_leave_torch_its_threads():
@@ -77,17 +83,15 @@ def test_threads_that_adapt_at_once_leave_torch_its_threads():
             ended.wait(10)
             return threads.for_kernels()
 
-    torch.set_num_threads(3)
-    try:
+    with torch_has(3):
         with ThreadPoolExecutor(1) as pool:
             with threads.limited(None, shared=True):
                 counted = pool.submit(lambda: (second(), torch.get_num_threads()))
                 begun.wait(10)
             ended.set()
             assert counted.result() == (3, 3)
-        assert torch.get_num_threads() == in_a_thread(torch.get_num_threads) == 3
-    finally:
-        torch.set_num_threads(1)
+        with ThreadPoolExecutor(1) as pool:
+            assert torch.get_num_threads() == pool.submit(torch.get_num_threads).result() == 3
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
@@ -166,9 +170,7 @@ def test_all_threads_have_ended_when_one_fails():
 
 
 def test_torch_keeps_to_one_thread_and_gets_its_own_back():
-    before = torch.get_num_threads()
-    torch.set_num_threads(3)
-    try:
+    with torch_has(3):
         with threads.limited(None, shared=True):
             assert (torch.get_num_threads(), threads.for_kernels(), threads.for_views()) == (1, 3, 3)
             with threads.lent_to_torch():
@@ -179,8 +181,6 @@ def test_torch_keeps_to_one_thread_and_gets_its_own_back():
         with threads.limited(2, shared=False):
             assert (torch.get_num_threads(), threads.for_kernels(), threads.for_views()) == (2, 2, 1)
         assert torch.get_num_threads() == threads.for_kernels() == 3 and threads.for_views() == 1
-    finally:
-        torch.set_num_threads(before)
 
 
 def test_no_threads_are_refused():
@@ -209,12 +209,9 @@ def test_numbers_of_threads_that_are_none_are_refused(wrong):
 
 
 def test_what_a_command_measures_has_the_threads_that_were_asked_for(tmp_path):
-    before = torch.get_num_threads()
-    try:
-        wrap(Base(tiny.folder(tmp_path / "base")), threads=before + 1)
-        assert torch.get_num_threads() == before + 1
-    finally:
-        torch.set_num_threads(before)
+    with torch_has(1):
+        wrap(Base(tiny.folder(tmp_path / "base")), threads=2)
+        assert torch.get_num_threads() == 2
 
 
 def test_a_wrapped_model_renders_with_its_own_threads():
@@ -234,9 +231,8 @@ def test_a_wrapped_model_renders_with_its_own_threads():
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_a_forked_worker_that_asks_for_threads_does_not_wait_for_those_of_its_parent():
-    before, large = torch.get_num_threads(), torch.ones(1 << 18)
-    torch.set_num_threads(2)
-    try:
+    large = torch.ones(1 << 18)
+    with torch_has(2):
         large.exp()  # in two threads
         worker = os.fork()
         if not worker:
@@ -247,8 +243,6 @@ def test_a_forked_worker_that_asks_for_threads_does_not_wait_for_those_of_its_pa
                 os._exit(0)
             finally:
                 os._exit(1)
-    finally:
-        torch.set_num_threads(before)
     try:
         wait_until(lambda: os.waitpid(worker, os.WNOHANG) == (worker, 0), seconds=10)
     except BaseException:

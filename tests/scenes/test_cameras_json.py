@@ -101,14 +101,10 @@ def test_blender_cameras_of_several_folders_are_for_testing_up_to_the_first_repe
     assert count_test_cameras(moments * 5) == 30
 
 
-def test_without_eval_every_camera_is_for_training(tmp_path):
+@pytest.mark.parametrize(("held_out", "splits"), [(False, ["train"] * 4), (True, ["test", "test", "train", "train"])])
+def test_with_eval_the_leading_cameras_are_for_testing_and_without_none(tmp_path, held_out, splits):
     path = write_json(tmp_path / "cameras.json", [entry(img_name=name) for name in "abab"])
-    assert [camera.split for camera in read_cameras(path, {"eval": False})] == ["train"] * 4
-
-
-def test_with_eval_the_leading_cameras_are_for_testing(tmp_path):
-    path = write_json(tmp_path / "cameras.json", [entry(img_name=name) for name in "abab"])
-    assert [camera.split for camera in read_cameras(path, {"eval": True})] == ["test", "test", "train", "train"]
+    assert [camera.split for camera in read_cameras(path, {"eval": held_out})] == splits
 
 
 @pytest.mark.parametrize(
@@ -159,7 +155,10 @@ def test_a_capture_sorted_by_name_holds_out_what_its_photographs_do(shared_data)
 )
 def test_training_size_of_flowers(cfg, size):
     assert trained_size(5025, 3312, cfg) == size
-    assert trained_size(1600, 900, {"resolution": -1}) == (1600, 900)  # which is not capped
+
+
+def test_a_width_of_1600_is_not_capped():
+    assert trained_size(1600, 900, {"resolution": -1}) == (1600, 900)
 
 
 @pytest.mark.parametrize("resolution", [0, -2, "half", None])

@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 import torch
 from colmap_files import SHIFT, names, write_photographs, write_text_model
+from scene_files import ROTATION
 
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.scenes import load_scene
 
 pycolmap = pytest.importorskip("pycolmap", reason="COLMAP scenes are read by pycolmap, an extra")
-
-# FORMATS §13, T2: the rotation of the pose that a model is written with.
-ROTATION = [[0.726315789, -0.610526316, -0.315789474], [0.526315789, 0.789473684, -0.315789474], [0.442105263, 0.063157895, 0.894736842]]
 
 
 def test_a_camera_is_where_colmap_says(tmp_path):
@@ -131,7 +129,7 @@ def test_notes_say_what_was_assumed(tmp_path):
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
 def test_the_model_is_found_where_programs_leave_it(tmp_path, place):
-    write_text_model(tmp_path / "s" / place, names(1)) if place != "." else write_text_model(tmp_path / "s", names(1))
+    write_text_model(tmp_path / "s" / place, names(1))
     assert len(load_scene(tmp_path / "s").cameras) == 1
 
 

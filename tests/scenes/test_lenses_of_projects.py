@@ -20,6 +20,7 @@ from mipmap_plugin.scenes import Scene, load_scene, read_cameras, write_cameras
 from mipmap_plugin.wrap import wrap_model
 
 EYE = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
+APPLIED = torch.tensor([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
 
 
 def of_gsplat(path, factor):
@@ -59,9 +60,11 @@ def transforms(folder, width=3300, height=2200, **facts):
     return load_scene(folder)
 
 
-def of_nerfstudio(path, scale=1.0, transform=EYE):
+def of_nerfstudio(path, scale=1.0, options=""):
+    """A run whose config.yml has further options, in an untransformed world."""
     folder = splatfacto_folder(path, splats(), downscale="null")
-    (folder / "dataparser_transforms.json").write_text(json.dumps({"transform": transform, "scale": scale}))
+    (folder / "dataparser_transforms.json").write_text(json.dumps({"transform": EYE, "scale": scale}))
+    (folder / "config.yml").write_text((folder / "config.yml").read_text() + options + "\n")
     return load_model(folder)
 
 
@@ -102,9 +105,8 @@ def test_a_scale_that_was_applied_before_is_not_applied_again(tmp_path):
 
 @pytest.mark.parametrize("turned", [True, False])
 def test_photographs_of_nerfstudio_judge_a_base_of_colmaps_world(tmp_path, turned):
-    applied = torch.tensor([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]], dtype=torch.float64)
-    there = [view.moved(applied) for view in tiny.cameras(3)]
-    scene = Scene(tuple(there), {}, tmp_path, ["one"], applied=applied)
+    there = [view.moved(APPLIED) for view in tiny.cameras(3)]
+    scene = Scene(tuple(there), {}, tmp_path, ["one"], applied=APPLIED)
     base = wrap_model(tiny.model(), cameras=tiny.cameras(3) if turned else there)
     found = base.place(scene)
     for camera, own in zip(found.cameras, base.cameras, strict=True):
@@ -115,18 +117,16 @@ def test_photographs_of_nerfstudio_judge_a_base_of_colmaps_world(tmp_path, turne
 
 @pytest.mark.parametrize(("there", "here", "turned"), [(12, 2, True), (2, 12, True), (12, 12, False)])
 def test_applied_transform_is_taken_back_for_some_of_the_views_and_not_for_cameras_of_a_third_world(tmp_path, there, here, turned):
-    applied = torch.tensor([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
     views, third = tiny.cameras(12), torch.diag(torch.tensor([-0.3, -0.3, 0.3, 1], dtype=torch.float64))
-    scene = Scene(tuple(view.moved(applied) for view in views[:there]), {}, tmp_path, [], applied=applied)
+    scene = Scene(tuple(view.moved(APPLIED) for view in views[:there]), {}, tmp_path, [], applied=APPLIED)
     base = wrap_model(tiny.model(), cameras=[view if turned else view.moved(third) for view in views[:here]])
     assert (base.place(scene) is not scene) == turned
 
 
 def test_thousands_of_cameras_tell_their_world_without_a_number_for_each_pair(tmp_path, monkeypatch):
     monkeypatch.setattr("mipmap_plugin.adaptation.target.photographs.LOOKED_AT", 8)
-    applied = torch.tensor([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
     views = tiny.cameras(60)
-    scene = Scene(tuple(view.moved(applied) for view in views), {}, tmp_path, [], applied=applied)
+    scene = Scene(tuple(view.moved(APPLIED) for view in views), {}, tmp_path, [], applied=APPLIED)
     with Largest() as largest:
         assert wrap_model(tiny.model(), cameras=views).place(scene) is not scene
     assert largest.numbers < 60 * 20
@@ -160,16 +160,14 @@ def test_nerfstudio_holds_out_the_views_that_its_config_says(tmp_path, options, 
     """data/utils/dataparsers_utils.py, in the order of names, whatever that of the frames is."""
     names = [f"{number:02d}_{'eval' if number in (3, 9) else 'train'}" for number in range(11)]
     cameras = tuple(replace(view, name=name) for name, view in zip(names, tiny.cameras(11), strict=True))[::-1]
-    of_nerfstudio(tmp_path / "r")
-    config = tmp_path / "r/config.yml"
-    config.write_text(config.read_text() + options + "\n")
-    held_out = [camera.name for camera in placed(load_model(tmp_path / "r"), Scene(cameras, {}, tmp_path)).split("test")]
+    model = of_nerfstudio(tmp_path / "r", options=options)
+    held_out = [camera.name for camera in placed(model, Scene(cameras, {}, tmp_path)).split("test")]
     assert sorted(held_out) == [names[number] for number in tests]
     eighths = tuple(replace(camera, split="test" if number % 8 == 0 else "train") for number, camera in enumerate(cameras[::-1]))
-    colmap = placed(load_model(tmp_path / "r"), Scene(eighths, {}, tmp_path, points=torch.zeros(1, 3))).split("test")
+    colmap = placed(model, Scene(eighths, {}, tmp_path, points=torch.zeros(1, 3))).split("test")
     assert [camera.name for camera in colmap] == [names[number] for number in (tests if options else [0, 8])]
     listed = Scene((replace(cameras[0], split="test"), *cameras[1:]), {}, tmp_path)  # by the file of the scene, which wins
-    assert [camera.name for camera in placed(load_model(tmp_path / "r"), listed).split("test")] == [cameras[0].name]
+    assert [camera.name for camera in placed(model, listed).split("test")] == [cameras[0].name]
 
 
 @pytest.mark.parametrize(
@@ -182,11 +180,8 @@ def test_nerfstudio_orders_the_images_of_colmap_by_their_numbers(tmp_path, optio
     names = [f"{number:02d}_{'eval' if number in (3, 9) else 'train'}" for number in range(11)]
     cameras = tuple(replace(view, name=name) for name, view in zip(names, tiny.cameras(11), strict=True))
     order = [9, 0, 2, 1, 10, 3, 5, 4, 6, 8, 7]
-    of_nerfstudio(tmp_path / "r")
-    config = tmp_path / "r/config.yml"
-    config.write_text(config.read_text() + options + "\n")
     scene = Scene(cameras, {}, tmp_path, points=torch.zeros(1, 3), numbers=tuple(order.index(place) + 1 for place in range(11)))
-    found = placed(load_model(tmp_path / "r"), scene).split("test")
+    found = placed(of_nerfstudio(tmp_path / "r", options=options), scene).split("test")
     assert [camera.name for camera in found] == [names[number] for number in sorted(tests)]
 
 
@@ -195,10 +190,7 @@ def test_nerfstudio_orders_frames_by_their_paths(tmp_path, names):
     """data/dataparsers/nerfstudio_dataparser.py: of the cameras of a rig, whose files have the same names or not, one after the other."""
     frames = [{"file_path": name, "transform_matrix": [[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0]]} for x, name in enumerate(names)]
     (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 60.0, "w": 64, "h": 48, "frames": frames}))
-    of_nerfstudio(tmp_path / "r")
-    config = tmp_path / "r/config.yml"
-    config.write_text(config.read_text() + "eval_mode: interval\neval_interval: 2\n")
-    found = placed(load_model(tmp_path / "r"), load_scene(tmp_path)).split("test")
+    found = placed(of_nerfstudio(tmp_path / "r", options="eval_mode: interval\neval_interval: 2"), load_scene(tmp_path)).split("test")
     assert sorted(camera.center[0].item() for camera in found) == [0, names.index(sorted(names[2:])[0])]
 
 

@@ -17,7 +17,7 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.evaluation.evaluate import all_rows, evaluator_of
 from mipmap_plugin.evaluation.metrics import psnr
-from mipmap_plugin.formats.images import read_image, write_image
+from mipmap_plugin.formats.images import read_image
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import load_scene
@@ -32,19 +32,9 @@ SCALE = 0.25
 def in_checkpoint_frame(raw):
     """The same splats, without view-dependent color, after ORIENTED and SCALE: a cyclic exchange of axes turns quaternions alike."""
     rotation, shift = torch.tensor(ORIENTED[:3, :3]).float(), torch.tensor(ORIENTED[:3, 3]).float()
-    w, x, y, z = raw["quats"].unbind(1)
-    turn = torch.tensor([0.5, 0.5, 0.5, 0.5])  # x to y, y to z, z to x
-    quats = torch.stack(
-        [
-            turn[0] * w - turn[1] * x - turn[2] * y - turn[3] * z,
-            turn[0] * x + turn[1] * w + turn[2] * z - turn[3] * y,
-            turn[0] * y - turn[1] * z + turn[2] * w + turn[3] * x,
-            turn[0] * z + turn[1] * y - turn[2] * x + turn[3] * w,
-        ],
-        1,
-    )
+    turn = 0.5 * torch.tensor([[1.0, -1, -1, -1], [1, 1, -1, 1], [1, 1, 1, -1], [1, -1, 1, 1]])  # times (1, 1, 1, 1) / 2: x to y, y to z, z to x
     means = SCALE * (raw["means"] @ rotation.T + shift)
-    return {**raw, "means": means, "quats": quats, "scales": raw["scales"] + np.log(SCALE), "shN": 0 * raw["shN"]}
+    return {**raw, "means": means, "quats": raw["quats"] @ turn.T, "scales": raw["scales"] + np.log(SCALE), "shN": 0 * raw["shN"]}
 
 
 @pytest.fixture(scope="module")
@@ -56,20 +46,13 @@ def run(tmp_path_factory):
     folder = splatfacto_folder(place / "run", in_checkpoint_frame(raw))
     product = (ORIENTED @ APPLIED)[:3]
     (folder / "dataparser_transforms.json").write_text(json.dumps({"transform": product.tolist(), "scale": SCALE}))
-    scene = place / "scene"
-    (scene / "images").mkdir(parents=True)
-    frames = []
-    model = VanillaModel(raw)
-    for view in tiny.cameras(4, width=64, height=48):
-        pose = torch.linalg.inv(view.viewmat) @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-        frames.append({"file_path": f"images/{view.name}.png", "transform_matrix": pose.tolist(), "fl_x": view.fx, "fl_y": view.fy})
-        write_image(scene / f"images/{view.name}.png", photograph(model, view))
-    (scene / "transforms.json").write_text(json.dumps({"w": 64, "h": 48, "applied_transform": APPLIED[:3].tolist(), "frames": frames}))
+    scene, model, effects = place / "scene", VanillaModel(raw), Effects(1, background=(0.1490, 0.1647, 0.2157), near_plane=0.04)
+    views = tiny.cameras(4, width=64, height=48)
+    tiny.write_photographs(scene, "train", views, lambda view: ReferenceBackend().render(model.gaussians(), view, effects).image)
+    file = scene / "transforms_train.json"
+    listed = json.loads(file.read_text()) | {"w": 64, "h": 48, "applied_transform": APPLIED[:3].tolist()}
+    file.rename(scene / "transforms.json").write_text(json.dumps(listed))
     return folder, scene
-
-
-def photograph(model, view):
-    return ReferenceBackend().render(model.gaussians(), view, Effects(1, background=(0.1490, 0.1647, 0.2157), near_plane=0.04)).image
 
 
 def test_a_placed_camera_sees_what_its_photograph_shows(run):

@@ -44,8 +44,7 @@ def photograph(model, params, size=(WIDTH, HEIGHT)):
 
 
 def colmap_scene(path, model, size=(WIDTH, HEIGHT)):
-    write_text_model(path / "sparse/0", names(1), model, " ".join(map(str, LENSES[model])))
-    (path / "sparse/0/cameras.txt").write_text(f"1 {model} {WIDTH} {HEIGHT} {' '.join(map(str, LENSES[model]))}\n")
+    write_text_model(path / "sparse/0", names(1), model, " ".join(map(str, LENSES[model])), size=(WIDTH, HEIGHT))
     (path / "images").mkdir()
     write_image(path / "images" / names(1)[0], photograph(model, LENSES[model], size))
     return load_scene(path)

@@ -8,29 +8,20 @@ import torch
 from mipmap_plugin.process.pool import LARGE
 from mipmap_plugin.splatting.bands import joined, neighbors
 
+MANY = LARGE // 4 // 45 + 1
 
-@pytest.mark.parametrize("count", [3, LARGE // 4 // 45 + 1], ids=["small", "large"])
+
+@pytest.mark.parametrize(("count", "side_by_side"), [(3, False), (MANY, False), (MANY, True)], ids=["small", "large", "large neighbors"])
 @pytest.mark.parametrize("frozen", [False, True], ids=["all", "shN frozen"])
-def test_values_and_gradients_are_those_of_cat(count, frozen):
-    sh0, shN = torch.rand(count, 1, 3, requires_grad=True), torch.rand(count, 15, 3, requires_grad=not frozen)
-    weights, expected = torch.rand(count, 16, 3), torch.cat([sh0, shN], dim=1)
-    assert torch.equal(joined(sh0, shN), expected)
-    (joined(sh0, shN) * weights).sum().backward()
-    assert torch.equal(sh0.grad, weights[:, :1]) and sh0.grad.is_contiguous()
-    assert shN.grad is None if frozen else torch.equal(shN.grad, weights[:, 1:])
-
-
-@pytest.mark.parametrize("frozen", [False, True], ids=["all", "shN frozen"])
-def test_large_neighbors_are_joined_without_a_copy_and_have_gradients(frozen):
-    count = LARGE // 4 // 45 + 1
+def test_values_and_gradients_are_those_of_cat(count, side_by_side, frozen):
     apart = {"means": torch.rand(count, 3), "sh0": torch.rand(count, 1, 3), "shN": torch.rand(count, 15, 3)}
-    held = neighbors(apart)
-    assert all(torch.equal(held[name], tensor) for name, tensor in apart.items()) and held["sh0"].data_ptr() != apart["sh0"].data_ptr()
+    held = neighbors(apart) if side_by_side else apart
+    assert all(torch.equal(held[name], tensor) for name, tensor in apart.items())
     sh0, shN, weights = held["sh0"].requires_grad_(), held["shN"].requires_grad_(not frozen), torch.rand(count, 16, 3)
     whole = joined(sh0, shN)
-    assert whole.data_ptr() == sh0.data_ptr() and torch.equal(whole, torch.cat([sh0, shN], dim=1))
+    assert torch.equal(whole, torch.cat([sh0, shN], dim=1)) and (whole.data_ptr() == sh0.data_ptr()) == side_by_side  # without a copy
     (whole * weights).sum().backward()
-    assert torch.equal(sh0.grad, weights[:, :1])
+    assert torch.equal(sh0.grad, weights[:, :1]) and sh0.grad.is_contiguous()
     assert shN.grad is None if frozen else torch.equal(shN.grad, weights[:, 1:])
 
 

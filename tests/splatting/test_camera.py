@@ -92,22 +92,6 @@ def test_equal_cameras_are_different_keys(camera):
     assert len({camera: 0, camera.zoomed(1.0): 1}) == 2
 
 
-def test_viewmat_is_kept_in_float64():
-    assert Camera(2, 2, 1.0, 1.0, 1.0, 1.0, torch.eye(4)).viewmat.dtype == torch.float64
-
-
-def test_a_viewmat_of_another_shape_is_refused():
-    with pytest.raises(ShapeError, match=r"expected shape \[4, 4\], got \[3, 4\]"):
-        Camera(2, 2, 1.0, 1.0, 1.0, 1.0, torch.eye(4)[:3])
-
-
-@pytest.mark.parametrize("size", [(0, 4, 1.0), (4, 4, 0.0), (4, 4, -1.0)])
-def test_an_empty_image_or_a_focal_length_that_is_not_positive_is_refused(size):
-    width, height, focal = size
-    with pytest.raises(SettingsError, match="image size and focal lengths must be positive and finite, got"):
-        Camera(width, height, focal, focal, 0.0, 0.0, torch.eye(4))
-
-
 def test_a_pose_is_copied_so_that_its_owner_cannot_move_the_camera():
     pose = torch.eye(4, dtype=torch.float64)
     view = Camera(8, 6, 9.0, 9.0, 4.0, 3.0, pose)
@@ -171,6 +155,10 @@ def test_matrices_of_no_camera_are_named(make, sentence):
     (dict(width=8.5), "width must be a whole number, got 8.5"),
     (dict(fx="9"), "fx must be a number, got '9'"),
     (dict(cy=None), "cy must be a number"),
+    (dict(width=0), "image size and focal lengths must be positive and finite, got"),
+    (dict(fx=0.0), "image size and focal lengths must be positive and finite, got"),
+    (dict(fy=-1.0), "image size and focal lengths must be positive and finite, got"),
+    (dict(viewmat=torch.eye(4)[:3]), r"expected shape \[4, 4\], got \[3, 4\]"),
     (dict(viewmat="eye"), "expected a tensor or an array of shape"),
     (dict(viewmat=torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 5, 1]])), "the last row of viewmat must be 0 0 0 1"),
     (dict(viewmat=torch.diag(torch.tensor([1.0, 1, 0, 1]))), "viewmat cannot be inverted"),

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import torch
 from anchor_checkpoints import STANDARD, VOXEL, Layout
+from oracle import rotation_one
 
 
 def decode(columns, states, layout: Layout, camera, appearance=None):
@@ -62,10 +64,8 @@ def visible(one, anchor, camera):
     x, y, z = view[:3, :3] @ anchor + view[:3, 3]
     if z <= 0.2:
         return False
-    scales, (w, i, j, k) = np.exp([one[f"scale_{c}"] for c in range(3)]), quaternion_of(one)
-    rotation = np.array([[1 - 2 * (j * j + k * k), 2 * (i * j - w * k), 2 * (i * k + w * j)],
-                         [2 * (i * j + w * k), 1 - 2 * (i * i + k * k), 2 * (j * k - w * i)],
-                         [2 * (i * k - w * j), 2 * (j * k + w * i), 1 - 2 * (i * i + j * j)]])  # fmt: skip
+    scales, quaternion = (np.array([one[f"{name}_{c}"] for c in range(count)]) for name, count in (("scale", 3), ("rot", 4)))
+    scales, rotation = np.exp(scales), rotation_one(torch.from_numpy(quaternion / math.sqrt(quaternion @ quaternion))).numpy()
     covariance = rotation @ np.diag(scales**2) @ rotation.T
     limit = 1.3 * np.array([camera.width / camera.fx, camera.height / camera.fy]) / 2
     u, v = np.clip([x / z, y / z], -limit, limit)
@@ -79,11 +79,6 @@ def visible(one, anchor, camera):
         if first >= last:
             return False
     return True
-
-
-def quaternion_of(one):
-    quaternion = np.array([one[f"rot_{c}"] for c in range(4)])
-    return quaternion / math.sqrt(quaternion @ quaternion)
 
 
 def faded(one, columns, anchor, eye, layout, camera):

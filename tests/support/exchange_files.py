@@ -2,6 +2,7 @@
 
 import json
 import struct
+import sys
 
 import pytest
 
@@ -14,8 +15,7 @@ RECORD = bytes.fromhex("7a72abc1b6e792c1f011b5c1b6cbe23f9f59683f0c309c4075c9ffff
 SPZ = struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 0, 12, 0, 0) + bytes(20)
 
 # A stand-in for splat-transform: it returns the PLY beside it, and records its arguments. Its own choice is SPZ 4, which Spark does not read.
-STAND_IN = """#!{python}
-import json, pathlib, shutil, sys
+STAND_IN = """import json, pathlib, shutil
 here = pathlib.Path(__file__).parent
 if sys.argv[1:] == ["--version"]:
     sys.exit(print("splat-transform v3.7.0 (0a1b2c3)", file=sys.stderr))
@@ -32,6 +32,17 @@ shutil.copyfile(here / "answer.ply" if target.endswith("plain.ply") else source,
 
 def tool_request(tool):
     return json.loads((tool / "asked.json").read_text())
+
+
+def answer_by(tool, script, name="splat-transform"):
+    """Have a few lines of Python answer in place of the stand-in."""
+    (tool / name).write_text(f"#!{sys.executable}\nimport os, sys\n{script}\n", encoding="utf-8")
+    (tool / name).chmod(0o755)
+
+
+def report_of(file):
+    """What the report beside an adapted file says."""
+    return json.loads(file.with_name(f"{file.name}.adaptation.json").read_text())
 
 
 def sentence(path):

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS
+from mipmap_plugin.gaussians import Gaussians
 
 # What yaml.dump(vars(cfg)) of gsplat's simple_trainer leaves: a tag of a Python object, and lists, among plain lines.
 CFG_YML = """antialiased: {antialiased}
@@ -101,6 +102,25 @@ def splatfacto_folder(
     pipeline = {"_model.device_indicator_param": torch.zeros(0), **splatfacto_state(raw, prefix), "_model.lpips.net.lin0.weight": torch.ones(2)}
     torch.save(splatfacto_content(pipeline), folder / "nerfstudio_models/step-000029999.ckpt")
     return folder
+
+
+class Hostile:
+    """What runs code where it is unpickled."""
+
+    def __reduce__(self):
+        return print, ("executed",)
+
+
+def equal(model, raw: dict[str, torch.Tensor]) -> bool:
+    """Whether a model has these raw parameters, bit by bit."""
+    return all(torch.equal(model.parameters()[name], tensor) for name, tensor in raw.items())
+
+
+def activated(raw: dict[str, torch.Tensor]) -> Gaussians:
+    """In float64: exp, sigmoid, sh0 before shN; gsplat normalizes quaternions inside."""
+    wide = {name: tensor.double() for name, tensor in raw.items()}
+    sh = torch.cat([wide["sh0"], wide["shN"]], 1)
+    return Gaussians(wide["means"], wide["quats"], wide["scales"].exp(), wide["opacities"].sigmoid(), sh)
 
 
 def aim(base, camera, scale: float) -> Tensor:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from mipmap_plugin.formats.ply import read_ply, write_ply
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.tiles import truth
 from mipmap_plugin.tiles.folder import work_folder
 from mipmap_plugin.tiles.reading import make_cut
+from mipmap_plugin.tiles.report import make_report
 from mipmap_plugin.tiles.scene import opened
 from mipmap_plugin.tiles.truth import draw_truths, parts
 
@@ -22,6 +24,17 @@ def cut_in_three(job, **settings):
     for part in range(parts(scene.used_views)):
         draw_truths(scene, part)
     return scene
+
+
+def rewritten(job, change):
+    """The file of a job's base, whose columns are now what `change` makes of them."""
+    [file] = job.base.checkpoint.rglob("*.ply")
+    return write_ply(file, change(read_ply(file).columns), overwrite=True)
+
+
+def report(scene, file):
+    """The report of a scene whose tiles are adapted."""
+    return make_report(scene, [file], [], {"total": 1.0}, {}, "the start")
 
 
 def config(**settings):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import contextmanager
 from dataclasses import replace
 from unittest.mock import Mock
 
@@ -25,6 +26,10 @@ from mipmap_plugin.tiles.folder import truth_file, work_folder
 from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
 from mipmap_plugin.tiles.store import Store
 from mipmap_plugin.tiles.sweeps import Sweep
+
+
+def columns_of(file):
+    return {name: column.tobytes() for name, column in read_ply(file).columns.items()}
 
 
 def test_the_result_does_not_depend_on_what_was_done_before(job, monkeypatch):
@@ -53,8 +58,7 @@ def test_the_result_does_not_depend_on_what_was_done_before(job, monkeypatch):
     assert tiles == ["finished before", "done", "finished before"]
     before = [outcome.status for outcome in outcomes if outcome.job.work not in ("tile", "steering") and outcome.job.sweep == 0]
     assert set(before) == {"finished before"}
-    assert read_ply(joined.file).columns["x"].tobytes() == read_ply(undisturbed).columns["x"].tobytes()
-    assert read_ply(joined.file).columns["f_rest_0"].tobytes() == read_ply(undisturbed).columns["f_rest_0"].tobytes()
+    assert columns_of(joined.file) == columns_of(undisturbed)
 
 
 def test_an_interrupted_tile_is_resumed(job, monkeypatch):
@@ -77,10 +81,6 @@ def test_tiles_of_another_request_are_not_touched(job):
         adapt_in_tiles(job, 2)
 
 
-def failing(*_):
-    raise OSError("no space left")
-
-
 def test_tiles_of_a_version_that_cut_across_sizes_are_refused(job):
     """They ended in an error wherever a plane lay across an axis that is none."""
     work_folder(job.target).mkdir()
@@ -94,7 +94,7 @@ def test_tiles_of_a_version_that_cut_across_sizes_are_refused(job):
 def test_tiles_are_not_gone_on_with_for_other_cameras(job, monkeypatch):
     """Whose path is the same."""
     with monkeypatch.context() as patched, pytest.raises(JobsFailed):
-        patched.setattr(tile, "adapt", failing)
+        patched.setattr(tile, "adapt", Mock(side_effect=OSError("no space left")))
         adapt_in_tiles(job, 2)
     (job.base.checkpoint / "cameras.json").unlink()
     write_cameras(job.base.checkpoint / "cameras.json", tiny.cameras(3, seed=5, width=20, height=16))
@@ -107,7 +107,7 @@ def test_saving_the_base_leaves_the_starts_to_the_next_run(job, monkeypatch):
     folder = work_folder(job.target)
     with monkeypatch.context() as patched, pytest.raises(OSError, match="no space left"):
         patched.setattr(run, "judged", lambda scene: ({}, AS_IT_IS))
-        patched.setattr(run, "_save", failing)
+        patched.setattr(run, "_save", Mock(side_effect=OSError("no space left")))
         adapt_in_tiles(job, 2)
     starts = Store(folder / "start_0.splats").parameters()["opacities"]
     assert not torch.equal(starts, load_vanilla(folder / "part_0.ply").parameters()["opacities"])
@@ -154,10 +154,6 @@ def interrupted_at(work, sweep, number):
     return engine
 
 
-def columns_of(file):
-    return {name: column.tobytes() for name, column in read_ply(file).columns.items()}
-
-
 @pytest.mark.parametrize(
     ("work", "sweep", "number"), [("tile", 1, 1), ("steering", 1, 0), ("tile", 2, 1), ("steering", 2, 0), ("halo", 3, 0), ("tile", 3, 2)]
 )
@@ -189,11 +185,19 @@ def test_a_scale_that_is_interrupted_leaves_the_others_what_they_share(job, monk
     assert first.file.exists() and adapt_in_tiles(jobs[1], 2).file.exists() and not sizes
 
 
+@contextmanager
+def killed_as_it_appears(output, monkeypatch):
+    """A run that writes it ends with what it has left open, and removes nothing."""
+    close = staging.Staging.close
+    with monkeypatch.context() as patched:
+        patched.setattr(staging.Staging, "close", lambda self: os.close(self._lock) if self.path == output else close(self))
+        yield patched
+
+
 def test_a_run_that_is_killed_while_it_deletes_its_tiles_is_in_nobodys_way(job, monkeypatch):
     """What was left of them had no plan, and was taken for other things."""
-    job, close = replace(job, settings=job.settings | {"steps": 0}, overwrite=True), staging.Staging.close
-    with monkeypatch.context() as patched:
-        patched.setattr(staging.Staging, "close", lambda self: os.close(self._lock) if self.path == job.target else close(self))
+    job = replace(job, settings=job.settings | {"steps": 0}, overwrite=True)
+    with killed_as_it_appears(job.target, monkeypatch):
         adapt_in_tiles(job, 2)
     assert not work_folder(job.target).exists() and list(job.target.parent.glob(".out.ply.?.tmp"))
     adapt_in_tiles(job, 2)
@@ -211,7 +215,7 @@ def test_no_folder_is_claimed_if_one_cannot_be(job):
 
 def test_a_disk_that_is_full_before_the_base_is_cut_leaves_no_plan_behind(job, monkeypatch):
     """Which would refuse other settings, for tiles that are not there."""
-    monkeypatch.setattr(plan, "make_cut", lambda *_: (_ for _ in ()).throw(OutputError("no space left")))
+    monkeypatch.setattr(plan, "make_cut", Mock(side_effect=OutputError("no space left")))
     with pytest.raises(OutputError, match="no space left"):
         next(adapt_all_in_tiles([job], 2))
     assert not work_folder(job.target).exists()
@@ -239,9 +243,7 @@ def test_what_a_run_that_was_killed_at_its_plan_leaves_is_in_nobodys_way(job):
 
 def test_the_lock_of_tiles_goes_with_them(job, monkeypatch):
     """Also where the run is killed as its output appears."""
-    close = staging.Staging.close
-    with monkeypatch.context() as patched:
-        patched.setattr(staging.Staging, "close", lambda self: os.close(self._lock) if self.path == job.target else close(self))
+    with killed_as_it_appears(job.target, monkeypatch) as patched:
         patched.setattr(plan, "release", lambda folder, lock: os.close(lock))
         adapt_in_tiles(replace(job, settings=job.settings | {"steps": 0}), 2)
     with pytest.raises(OutputExists):

@@ -24,6 +24,15 @@ from mipmap_plugin.tiles.steering import Steered, sweep_of
 from mipmap_plugin.tiles.sweeps import Sweep, sweeps, views_of
 
 
+def chosen(scene, monkeypatch, psnrs):
+    """The name of the start that is chosen where these PSNRs are measured, one after the other, and no more."""
+    measured = iter(psnrs)
+    monkeypatch.setattr("mipmap_plugin.tiles.start.psnr", lambda *_: next(measured))
+    StartSearch(scene).run()
+    assert not list(measured)
+    return torch.load(scene.folder / "start.pt")["name"]
+
+
 @pytest.mark.parametrize(
     ("psnrs", "name"),
     [
@@ -35,10 +44,7 @@ from mipmap_plugin.tiles.sweeps import Sweep, sweeps, views_of
 )
 def test_no_start_is_worse_than_the_base_and_none_is_tried_in_vain(job, monkeypatch, psnrs, name):
     scene = cut_in_three(job, merge_to=0.5, merging_costs=20.0)
-    measured = iter(psnrs)
-    monkeypatch.setattr("mipmap_plugin.tiles.start.psnr", lambda *_: next(measured))
-    StartSearch(scene).run()
-    assert torch.load(scene.folder / "start.pt")["name"] == name and not list(measured)
+    assert chosen(scene, monkeypatch, psnrs) == name
     assert sorted(file.name for file in scene.folder.glob("*.splats")) == ["base.splats", "start_0.splats", "start_1.splats", "start_2.splats"]
 
 
@@ -46,11 +52,9 @@ def test_no_start_is_worse_than_the_base_and_none_is_tried_in_vain(job, monkeypa
 def test_the_mildest_merging_may_cost_more_before_steps_for_another_renderer(job, monkeypatch, eps2d, name):
     scene = cut_in_three(job, merge_to=0.5)
     scene.target = replace(scene.target, eps2d=eps2d)
-    measured = iter((20.0, 30.0, 29.5, *((29.5, 29.5) if eps2d < DILATION else ())))  # the base, the closed form, what is merged least, and more
-    monkeypatch.setattr("mipmap_plugin.tiles.start.psnr", lambda *_: next(measured))
     monkeypatch.setattr("mipmap_plugin.tiles.start.draws_alike", lambda *_: False)
-    StartSearch(scene).run()
-    assert torch.load(scene.folder / "start.pt")["name"] == name and not list(measured)
+    psnrs = 20.0, 30.0, 29.5, *((29.5, 29.5) if eps2d < DILATION else ())  # the base, the closed form, what is merged least, and more
+    assert chosen(scene, monkeypatch, psnrs) == name
 
 
 @pytest.mark.parametrize(("steps", "name"), [(0, "the closed form"), (4, "the base as it is")])
@@ -58,10 +62,7 @@ def test_a_base_that_compensates_has_a_closed_form_where_no_step_follows(job, mo
     """As without tiles: lego_100, converted to such a base, has 32.1 dB in place of 29.4 at x1/2."""
     folder = tiny.folder(job.base.checkpoint.with_name("compensated"), tiny.cameras(3, width=20, height=16), trained=TrainedScale("antialiased", 0.3))
     scene = cut_in_three(replace(job, base=Base(folder)), steps=steps)
-    measured = iter((30.0, 31.0))
-    monkeypatch.setattr("mipmap_plugin.tiles.start.psnr", lambda *_: next(measured))
-    StartSearch(scene).run()
-    assert torch.load(scene.folder / "start.pt")["name"] == name
+    assert chosen(scene, monkeypatch, (30.0, 31.0) if steps == 0 else (30.0,)) == name
 
 
 def test_what_is_in_the_picture_but_not_seen_is_weighed_in_more_views(job):

@@ -9,44 +9,36 @@ import numpy as np
 import pytest
 import tiny
 import torch
-from cut_scenes import cut_in_three
+from cut_scenes import cut_in_three, report, rewritten
 
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import BackendUnavailable, CheckpointError, SettingsError
 from mipmap_plugin.formats.magic import SPLAT_RECORD
-from mipmap_plugin.formats.ply import read_ply, write_ply
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.health import ACTIVATED
 from mipmap_plugin.tiles.folder import work_folder
 from mipmap_plugin.tiles.reading import find_splats, make_cut
-from mipmap_plugin.tiles.report import make_report
 from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
 from mipmap_plugin.tiles.scene import opened
 
 
 def test_columns_that_tiles_do_not_hold_are_told_of(job):
-    [file] = job.base.checkpoint.rglob("*.ply")
-    columns = read_ply(file).columns
-    columns["nz"][-1] = 1  # normals, which 3DGS does not have
-    write_ply(file, columns | {"label": columns["x"]}, overwrite=True)
+    file = rewritten(job, lambda columns: columns | {"label": columns["x"], "nz": columns["x"]})  # normals, which 3DGS does not have
     scene = cut_in_three(job)
     with pytest.warns(UserWarning, match="the extra columns nx, ny, nz, label are dropped, since tiles hold none"):
-        assert make_report(scene, [file], [], {"total": 1.0}, {}, "the start").notes
+        assert report(scene, file).notes
 
 
 def test_a_second_set_of_colors_that_is_left_out_is_told_of(job):
-    [file] = job.base.checkpoint.rglob("*.ply")
-    columns = read_ply(file).columns
-    write_ply(file, columns | dict.fromkeys(("red", "green", "blue"), columns["x"]), overwrite=True)
-    [note] = make_report(cut_in_three(job), [file], [], {"total": 1.0}, {}, "the start").notes
+    file = rewritten(job, lambda columns: columns | dict.fromkeys(("red", "green", "blue"), columns["x"]))
+    [note] = report(cut_in_three(job), file).notes
     assert note.startswith("its columns red, green and blue are left out")
 
 
 def test_colors_up_to_255_are_those_of_the_whole_file_also_where_a_part_is_dark(job, monkeypatch):
     monkeypatch.setattr("mipmap_plugin.tiles.reading.CHUNK", 30)
-    [file] = job.base.checkpoint.rglob("*.ply")
     colors = dict.fromkeys(("red", "green", "blue"), np.repeat(np.float32([255, 5]), 40))
-    write_ply(file, {name: column for name, column in read_ply(file).columns.items() if not name.startswith("f_dc")} | colors, overwrite=True)
+    file = rewritten(job, lambda columns: {name: column for name, column in columns.items() if not name.startswith("f_dc")} | colors)
     read = cut_in_three(job).base.parameters(torch.arange(80))["sh0"]
     torch.testing.assert_close(read, load_model(file).parameters()["sh0"], rtol=0, atol=1e-6)
 
@@ -57,13 +49,11 @@ def test_bands_that_the_loader_of_a_viewer_does_not_read_are_told_of(job):
     scene = cut_in_three(job)
     scene.viewer = "spark"
     with pytest.warns(UserWarning, match="SH bands above degree 3 are left out, which loaders of spark do not read right"):
-        assert make_report(scene, [file], [], {"total": 1.0}, {}, "the start").notes
+        assert report(scene, file).notes
 
 
 def test_places_that_float32_does_not_hold_are_told_of(job):
-    [file] = job.base.checkpoint.rglob("*.ply")
-    columns = read_ply(file).columns
-    write_ply(file, columns | {"x": columns["x"].astype(float) + 5e6}, overwrite=True)
+    rewritten(job, lambda columns: columns | {"x": columns["x"].astype(float) + 5e6})
     folder = work_folder(job.target)
     folder.mkdir()
     with pytest.warns(UserWarning, match=r"80 of 80 splats lie so far .* steps of 0.5 units"):
@@ -71,23 +61,15 @@ def test_places_that_float32_does_not_hold_are_told_of(job):
 
 
 def test_splats_that_are_doubtful_or_left_out_are_told_of(job):
-    [file] = job.base.checkpoint.rglob("*.ply")
-    columns = {name: np.tile(column, 2) for name, column in read_ply(file).columns.items()}
-    columns["opacity"], columns["x"][0] = np.linspace(0, 1, 160, dtype=np.float32), np.nan
-    write_ply(file, columns, overwrite=True)
+    def doubtful(columns):
+        tiled = {name: np.tile(column, 2) for name, column in columns.items()}
+        return tiled | {"opacity": np.linspace(0, 1, 160, dtype=np.float32), "x": np.append(np.float32(np.nan), tiled["x"][1:])}
+
+    file = rewritten(job, doubtful)
     with pytest.warns(UserWarning, match=r"the opacities look like 0..1"), pytest.warns(UserWarning, match="1 of 160 splats was dropped"):
         scene = cut_in_three(job)
-    doubts = [ACTIVATED, "1 of 160 splats was dropped: not finite once activated"]
-    assert make_report(scene, [file], [], {"total": 1.0}, {}, "the start").notes == doubts
-
-
-def test_invalid_splats_are_left_out(tmp_path, job):
-    ply = next(job.base.checkpoint.rglob("*.ply"))
-    columns = dict(read_ply(ply).columns)
-    columns["opacity"] = columns["opacity"].copy()
-    columns["opacity"][5] = float("nan")
-    write_ply(ply, columns, overwrite=True)
-    assert adapt_in_tiles(job, 2).report.gaussians_before == 79
+    told = report(scene, file)
+    assert told.notes == [ACTIVATED, "1 of 160 splats was dropped: not finite once activated"] and told.gaussians_before == 159
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from contextlib import nullcontext
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -215,11 +216,7 @@ def test_the_command_removes_the_lock_of_one_that_was_killed_at_a_further_scale(
 
 
 def test_the_command_says_how_to_go_on_with_several_scales(job, capsys, monkeypatch):
-    def interrupted(*_):
-        raise KeyboardInterrupt("interrupted")
-        yield
-
-    monkeypatch.setattr(run, "adapt_all_in_tiles", interrupted)
+    monkeypatch.setattr(run, "adapt_all_in_tiles", Mock(side_effect=KeyboardInterrupt("interrupted")))
     options = ["adapt", str(job.base.checkpoint), "--steps", "0", "--tiles", "2", "--scale", "1/2"]
     two = ["--scale", "1/4"]
     for further, again in (([], "again to go on"), (two, "again to go on"), ([*two, "--overwrite"], "with --skip-existing")):

@@ -31,6 +31,11 @@ def splat(across: float, down: float, opacity: float = 0.9, color: float = 0.5, 
     return Gaussians(torch.tensor([means]), quats, scales, torch.tensor([opacity]), torch.full((1, 1, 3), (color - 0.5) / C0))
 
 
+def aside(halves: float) -> tuple[float, float, float]:
+    """A center as many halves of the picture to the right of its middle."""
+    return halves * SIZE / 2 * DEPTH / FOCAL, 0.0, DEPTH
+
+
 def alpha(backend, viewer: str, splats: Gaussians) -> torch.Tensor:
     """[SIZE, SIZE] alpha under a viewer whose packing, which has tests of its own, is left out."""
     effects = find_viewer(viewer).effects(Effects(0))

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from one_splat import BACKENDS, BOTH, DEPTH, FOCAL, MIDDLE, SIZE, alpha, camera, differentiable, splat
+from one_splat import BACKENDS, BOTH, MIDDLE, alpha, aside, camera, differentiable, splat
 
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.splatting.viewers import find_viewer
@@ -59,14 +59,17 @@ def test_cesium_drops_splats_smaller_than_two_of_its_pixels(backend):
 
 
 @BOTH
-@pytest.mark.parametrize(("viewer", "most"), [("spark", 1.4), ("gaussian-splats-3d", 1.2), ("splatapult", 1.5), ("gdgs", 1.2), ("web-splat", 1.2)])
+@pytest.mark.parametrize(
+    ("viewer", "most"),
+    [("spark", 1.4), ("gaussian-splats-3d", 1.2), ("splatapult", 1.5), ("gdgs", 1.2), ("web-splat", 1.2), ("lichtfeld", 1.4), ("kiri", 1.3)],
+)
 def test_a_splat_is_left_out_by_its_center(backend, viewer, most):
-    def seen(halves):
-        return alpha(backend, viewer, splat(900.0, 900.0, means=(halves * SIZE / 2 * DEPTH / FOCAL, 0.0, DEPTH))).max()
+    def seen(halves, viewer=viewer):
+        return alpha(backend, viewer, splat(900.0, 900.0, means=aside(halves))).max()
 
     assert seen(most - 0.01) > 0.5 and seen(1 - most) > 0.5
     assert seen(most + 0.01) == seen(-most - 0.01) == 0
-    assert alpha(backend, "playcanvas", splat(900.0, 900.0, means=(1.5 * SIZE / 2 * DEPTH / FOCAL, 0.0, DEPTH))).max() > 0.5
+    assert all(seen(1.5, other) > 0.5 for other in ("playcanvas", "brush", "inria"))
 
 
 @BOTH

@@ -5,13 +5,23 @@ from dataclasses import replace
 
 import pytest
 import torch
-from one_splat import BOTH, DEPTH, FOCAL, MIDDLE, SIZE, alpha, camera, differentiable, splat
+from one_splat import BOTH, MIDDLE, SIZE, alpha, camera, differentiable, splat
 
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import USUAL, RenderSettings
 from mipmap_plugin.splatting.viewers import find_viewer
 from mipmap_plugin.viewing.sources import coarser
+
+
+def weight(dx: float, dy: float, across: float, down: float) -> float:
+    return math.exp(-(dx**2 / across + dy**2 / down) / 2)
+
+
+def faded(weight: float) -> float:
+    """As PlayCanvas draws it, whose splats fade to nothing at the root of eight standard deviations."""
+    return (weight - math.exp(-4)) / (1 - math.exp(-4))
+
 
 # The screen filter and the edge
 
@@ -26,19 +36,17 @@ from mipmap_plugin.viewing.sources import coarser
 )
 def test_a_viewer_dilates_by_its_own_variance(backend, viewer, more):
     rendered = alpha(backend, viewer, splat(4.0, 1.0, 0.8))
-    end = math.exp(-4) if viewer == "playcanvas" else 0.0
     for x in (1, 3):
-        weight = math.exp(-(x**2) / 2 / (4.0 + more))
-        assert rendered[MIDDLE, MIDDLE + x] == pytest.approx(0.8 * (weight - end) / (1 - end), abs=2e-5)
+        whole = weight(x, 0, 4.0 + more, 1.0 + more)
+        assert rendered[MIDDLE, MIDDLE + x] == pytest.approx(0.8 * (faded(whole) if viewer == "playcanvas" else whole), abs=2e-5)
 
 
 @BOTH
 def test_playcanvas_fades_and_other_viewers_cut_at_the_root_of_eight(backend):
     # Dilated to 1 px²: pixels at 2 and 3 lie this side and that of 2.83 standard deviations.
-    faded = alpha(backend, "playcanvas", splat(0.925, 0.925, 0.9))
-    end = math.exp(-4)
-    assert faded[MIDDLE, MIDDLE + 2] == pytest.approx(0.9 * (math.exp(-2) - end) / (1 - end), abs=1e-5)
-    assert faded[MIDDLE + 2, MIDDLE + 2] == 0  # just at the edge: A = 1
+    fading = alpha(backend, "playcanvas", splat(0.925, 0.925, 0.9))
+    assert fading[MIDDLE, MIDDLE + 2] == pytest.approx(0.9 * faded(math.exp(-2)), abs=1e-5)
+    assert fading[MIDDLE + 2, MIDDLE + 2] == 0  # just at the edge: A = 1
     cut = alpha(backend, "antimatter15", splat(1.0, 1.0, 0.9))
     assert cut[MIDDLE, MIDDLE + 2] == pytest.approx(0.9 * math.exp(-2), abs=1e-5)
     assert cut[MIDDLE, MIDDLE + 3] == 0 < 0.9 * math.exp(-4.5) - 0.5 / 255
@@ -69,10 +77,6 @@ def test_an_opaque_splat_covers_more_than_in_training(backend):
     assert alpha(backend, "classic", splat(4.0, 4.0, 1.0))[MIDDLE, MIDDLE] == pytest.approx(0.99)
 
 
-def weight(dx: float, dy: float, across: float, down: float) -> float:
-    return 0.8 * math.exp(-(dx**2 / across + dy**2 / down) / 2)
-
-
 # GaussianSplats3D's eigenvalues
 
 
@@ -88,9 +92,9 @@ def test_gaussian_splats_3d_drops_small_round_splats(backend):
 def test_gaussian_splats_3d_draws_a_round_splat_upright(backend):
     rendered = alpha(backend, "gaussian-splats-3d", splat(1.0, 1.0, 0.8))
     for step in (1, 2):
-        down, across = (0.8 * math.exp(-(step**2) / 2 / (1.3 + sign * math.sqrt(0.1))) for sign in (1, -1))
-        assert rendered[MIDDLE + step, MIDDLE] == pytest.approx(down, abs=1e-5)
-        assert rendered[MIDDLE, MIDDLE + step] == pytest.approx(across, abs=1e-5)
+        across, down = 1.3 - math.sqrt(0.1), 1.3 + math.sqrt(0.1)
+        assert rendered[MIDDLE + step, MIDDLE] == pytest.approx(0.8 * weight(0, step, across, down), abs=1e-5)
+        assert rendered[MIDDLE, MIDDLE + step] == pytest.approx(0.8 * weight(step, 0, across, down), abs=1e-5)
 
 
 @BOTH
@@ -102,8 +106,7 @@ def test_gaussian_splats_3d_turns_a_nearly_round_splat(backend):
     rendered = alpha(backend, "gaussian-splats-3d", splat(1.3, 1.0, 0.8, turn=math.pi / 4))
     for dx, dy in ((1, 1), (1, -1), (2, 0), (0, 2)):
         along, across = dx * x + dy * y, dx * y - dy * x
-        weight = math.exp(-(along**2 / (middle + spread) + across**2 / (middle - spread)) / 2)
-        assert rendered[MIDDLE + dy, MIDDLE + dx] == pytest.approx(0.8 * weight, abs=2e-5)
+        assert rendered[MIDDLE + dy, MIDDLE + dx] == pytest.approx(0.8 * weight(along, across, middle + spread, middle - spread), abs=2e-5)
 
 
 @BOTH
@@ -113,9 +116,9 @@ def test_programs_that_took_its_eigenvalues_stretch_splats_or_drop_them(backend)
     stretched = {"vk-gaussian-splatting": math.sqrt(0.1), "metalsplatter": 0.1, "gdgs": 0.0}
     for viewer, spread in stretched.items():
         x, y = (1, spread) if viewer == "vk-gaussian-splatting" else (0, 1)
-        along, across = (2 * y) ** 2 / (x * x + y * y), (2 * x) ** 2 / (x * x + y * y)  # of a pixel two below the middle
-        weight = 0.8 * math.exp(-(along / (1.3 + spread) + across / (1.3 - spread)) / 2)
-        assert alpha(backend, viewer, round_one)[MIDDLE + 2, MIDDLE] == pytest.approx(weight, abs=1e-5)
+        along, across = 2 * y / math.hypot(x, y), 2 * x / math.hypot(x, y)  # of a pixel two below the middle
+        expected = 0.8 * weight(along, across, 1.3 + spread, 1.3 - spread)
+        assert alpha(backend, viewer, round_one)[MIDDLE + 2, MIDDLE] == pytest.approx(expected, abs=1e-5)
         assert (alpha(backend, viewer, small).max() == 0) == (viewer != "metalsplatter")
     assert alpha(backend, "vk-gaussian-splatting", a_little_larger).max() > 0
     assert alpha(backend, "gdgs", splat(0.0326, 1e-6)).max() > 0  # a needle of that mean
@@ -140,25 +143,14 @@ def test_a_splat_ends_and_is_covered_as_in_the_program(backend, viewer, radius, 
 
 
 @BOTH
-def test_lichtfeld_draws_half_a_step_of_8_bits_and_leaves_out_by_the_center(backend):
+def test_lichtfeld_draws_half_a_step_of_8_bits_and_limits_no_color(backend):
     """Its rasterizer of 2026; that of 2025 drew as Brush does."""
-    def seen(viewer, opacity, halves=0.0):
-        return alpha(backend, viewer, splat(900.0, 900.0, opacity, means=(halves * SIZE / 2 * DEPTH / FOCAL, 0.0, DEPTH))).max()
+    def seen(viewer, opacity):
+        return alpha(backend, viewer, splat(900.0, 900.0, opacity)).max()
 
     assert seen("lichtfeld", 0.7 / 255) > 0 == seen("brush", 0.7 / 255) == seen("lichtfeld", 0.4 / 255)
-    assert seen("lichtfeld", 0.9, 1.39) > 0.5 and seen("lichtfeld", 0.9, 1.41) == 0 < seen("brush", 0.9, 1.41)
     bright = backend.render(splat(4.0, 4.0, 0.5, 9.0), camera(), find_viewer("lichtfeld").effects(Effects(0))).image
     assert bright[MIDDLE, MIDDLE, 0].item() == pytest.approx(0.5 * 4, abs=1e-5)
-
-
-@BOTH
-def test_kiri_leaves_out_by_the_center_and_limits_colors_as_its_frame_buffer_does(backend):
-    """Its name was one for INRIA's viewer, which does neither."""
-    large, means = (900.0, 900.0, 0.9), [(halves * SIZE / 2 * DEPTH / FOCAL, 0.0, DEPTH) for halves in (1.29, 1.31)]
-    seen = {viewer: [bool(alpha(backend, viewer, splat(*large, means=each)).max() > 0) for each in means] for viewer in ("kiri", "inria")}
-    assert seen == {"kiri": [True, False], "inria": [True, True]}
-    bright = backend.render(splat(4.0, 4.0, 0.5, 9.0), camera(), find_viewer("kiri").effects(Effects(0))).image
-    assert bright[MIDDLE, MIDDLE, 0].item() == pytest.approx(0.5, abs=1 / 255)
 
 
 @BOTH
@@ -182,44 +174,29 @@ def test_half_axes_are_limited_as_the_viewer_does(backend, viewer, most):
     effects = replace(effects, screen_filter="classic", settings=replace(effects.settings, packing=None, picture_step=None))
     wide = replace(camera(), width=2400, height=3, cx=1200.0, cy=1.5)
     rendered = backend.render(splat(1e7, 4.0, 0.8), wide, effects).alpha[1]
-    assert rendered[1200 + most - 1].item() == pytest.approx(weight(most - 0.5, 0, most**2 / 8, 4), abs=1e-4)
+    assert rendered[1200 + most - 1].item() == pytest.approx(0.8 * weight(most - 0.5, 0, most**2 / 8, 4), abs=1e-4)
     assert rendered[1200 + most + 1] == 0 < rendered[1200 - most + 1]
 
 
-@BOTH
-def test_in_playcanvas_each_half_axis_fits_into_the_picture(backend):
-    # 21 px are the picture's shorter side: a variance of 21²/8 px² at most; at 45 degrees the other axis keeps 4 px².
-    rendered, end = alpha(backend, "playcanvas", splat(900.0, 4.0, 0.8, turn=math.pi / 4)), math.exp(-4)
-    for x, y in ((3, 3), (6, 5), (2, -2)):
-        along, across = (x + y) / math.sqrt(2), (x - y) / math.sqrt(2)
-        whole = weight(along, across, SIZE**2 / 8, 4.075) / 0.8
-        assert rendered[MIDDLE + y, MIDDLE + x].item() == pytest.approx(0.8 * (whole - end) / (1 - end), abs=1e-5)
+LONGEST = SIZE**2 / 8  # px², the variance of a half-axis that just fits into the picture
+# By what fits: the viewer, the splat's variances (px²) and turn, the variances that are left, and pixels to look at.
+FITTED = {
+    "each half-axis": ("playcanvas", (900.0, 4.0, math.pi / 4), (LONGEST, 4.075), [(3, 3), (6, 5), (2, -2)]),
+    "both half-axes": ("playcanvas", (900.0, 900.0, 0.0), (LONGEST, LONGEST), [(6, 3)]),
+    "the whole splat": ("playcanvas-webgpu", (900.0, 90.0, 0.0), (LONGEST, 90.075 * LONGEST / 900.075), [(5, 2)]),
+    # Askew it is 452 px² across and down, and made smaller by that; 110 px² along the axis are still longer than the picture.
+    "the whole, then its axis": ("playcanvas-webgpu", (900.0, 4.0, math.pi / 4), (LONGEST, 4.075 * LONGEST / 452.075), [(3, 3), (5, 5), (1, 1)]),
+}
 
 
 @BOTH
-def test_a_round_splat_fits_into_the_picture_too(backend):
-    rendered, end = alpha(backend, "playcanvas", splat(900.0, 900.0, 0.8)), math.exp(-4)
-    whole = weight(6, 3, SIZE**2 / 8, SIZE**2 / 8) / 0.8
-    assert rendered[MIDDLE + 3, MIDDLE + 6].item() == pytest.approx(0.8 * (whole - end) / (1 - end), abs=1e-5)
-
-
-@BOTH
-def test_webgpu_makes_the_whole_splat_smaller(backend):
-    # Of 900 px² across, 21²/8 are left, and of 90 down as large a share.
-    rendered, end = alpha(backend, "playcanvas-webgpu", splat(900.0, 90.0, 0.8)), math.exp(-4)
-    share = SIZE**2 / 8 / 900.075
-    whole = weight(5, 2, 900.075 * share, 90.075 * share) / 0.8
-    assert rendered[MIDDLE + 2, MIDDLE + 5].item() == pytest.approx(0.8 * (whole - end) / (1 - end), abs=1e-5)
-
-
-@BOTH
-def test_webgpu_shortens_the_axis_of_a_smaller_splat_that_lies_askew(backend):
-    # Of 452 px² across and down, 21²/8 are left; 110 px² along the axis are still longer than the picture.
-    rendered, end = alpha(backend, "playcanvas-webgpu", splat(900.0, 4.0, 0.8, turn=math.pi / 4)), math.exp(-4)
-    share = SIZE**2 / 8 / 452.075
-    for x, y in ((3, 3), (5, 5), (1, 1)):
-        whole = weight(math.hypot(x, y), 0, SIZE**2 / 8, 4.075 * share) / 0.8
-        assert rendered[MIDDLE + y, MIDDLE + x].item() == pytest.approx(0.8 * (whole - end) / (1 - end), abs=1e-5)
+@pytest.mark.parametrize(("viewer", "shape", "left", "pixels"), FITTED.values(), ids=FITTED)
+def test_a_splat_fits_into_the_picture(backend, viewer, shape, left, pixels):
+    across, down, turn = shape
+    rendered = alpha(backend, viewer, splat(across, down, 0.8, turn=turn))
+    for x, y in pixels:
+        along, beside = x * math.cos(turn) + y * math.sin(turn), y * math.cos(turn) - x * math.sin(turn)
+        assert rendered[MIDDLE + y, MIDDLE + x].item() == pytest.approx(0.8 * faded(weight(along, beside, *left)), abs=1e-5)
 
 
 @BOTH

@@ -72,10 +72,10 @@ def test_steps_leave_colors_within_those_that_the_file_holds(backend, viewer, li
 
 
 @BOTH
-def test_babylon_limits_colors_to_those_of_the_frame_buffer(backend):
-    drawn = {name: backend.render(splat(900.0, 900.0, 0.5, 3.0), camera(), find_viewer(name).effects(Effects(0))) for name in ("babylon", "classic")}
-    middle = {name: rendered.image[MIDDLE, MIDDLE, 0].item() for name, rendered in drawn.items()}
-    assert middle == pytest.approx({"babylon": 0.5, "classic": 1.5}, abs=0.01)
+@pytest.mark.parametrize(("viewer", "shown"), [("babylon", 0.5), ("kiri", 0.5), ("classic", 1.5)])
+def test_some_viewers_limit_colors_to_those_of_the_frame_buffer(backend, viewer, shown):
+    drawn = backend.render(splat(900.0, 900.0, 0.5, 3.0), camera(), find_viewer(viewer).effects(Effects(0)))
+    assert drawn.image[MIDDLE, MIDDLE, 0].item() == pytest.approx(shown, abs=0.01)
 
 
 # Pictures of 8 bits

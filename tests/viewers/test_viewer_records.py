@@ -104,15 +104,10 @@ def test_filters_that_integrate_are_no_viewers():
         assert "the screen filter analytic does not support culling by size" in backend.lacking(needs)
 
 
-def test_a_splat_that_fades_needs_an_end():
+@pytest.mark.parametrize("settings", [{"fades": True}, {"max_half_axis": 512.0}, {"fits_picture": True}])
+def test_a_splat_that_fades_or_whose_half_axes_are_limited_needs_an_end(settings):
     with pytest.raises(SettingsError, match="give radius"):
-        RenderSettings(fades=True)
-
-
-@pytest.mark.parametrize("limit", [{"max_half_axis": 512.0}, {"fits_picture": True}])
-def test_a_half_axis_that_is_limited_needs_an_end(limit):
-    with pytest.raises(SettingsError, match="give radius"):
-        RenderSettings(**limit)
+        RenderSettings(**settings)
 
 
 def test_sizes_keep_their_meaning_under_supersampling():

@@ -17,6 +17,11 @@ from mipmap_plugin.viewing.screen import inside
 from mipmap_plugin.viewing.sources import File, Request, Supersampled
 
 
+@pytest.fixture
+def adapter(base):
+    return Adapter(base, Supersampled("supersampled", base))
+
+
 def ended(adapter, wish):
     """What a run has come to when it has ended."""
     over = threading.Event()
@@ -66,22 +71,22 @@ def test_a_run_shows_its_states_and_stopped_it_returns_the_best_and_the_base_sta
     assert live.shown(0.5) == f"adapting, step {report.curve[-1].step}" and live.splats(Request(request.screen, 0.5)) is None
 
 
-def test_what_cannot_be_adapted_is_told(base):
-    progress = ended(Adapter(base, Supersampled("supersampled", base)), wish(base, recipe="nonsense"))
+def test_what_cannot_be_adapted_is_told(base, adapter):
+    progress = ended(adapter, wish(base, recipe="nonsense"))
     assert progress.adapted is None and "there is no recipe 'nonsense'" in progress.trouble
     assert "there is no recipe 'nonsense'" in words(progress)
 
 
-def test_only_one_run_at_a_time(base):
-    adapter, over = Adapter(base, Supersampled("supersampled", base)), threading.Event()
+def test_only_one_run_at_a_time(base, adapter):
+    over = threading.Event()
     adapter.start(wish(base, recipe="instant"), over.set)
     with pytest.raises(SettingsError, match="stop it first"):
         adapter.start(wish(base))
     assert over.wait(120) and adapter.progress.adapted is not None
 
 
-def test_of_two_that_start_at_once_one_is_refused(base, monkeypatch):
-    adapter, refused, others, over = Adapter(base, Supersampled("supersampled", base)), [], [], threading.Event()
+def test_of_two_that_start_at_once_one_is_refused(base, adapter, monkeypatch):
+    refused, others, over = [], [], threading.Event()
     clear = adapter._stopping.clear
 
     def another():
@@ -103,7 +108,7 @@ def test_of_two_that_start_at_once_one_is_refused(base, monkeypatch):
     assert refused == [True] and over.wait(120)
 
 
-def test_a_run_that_is_preparing_ends_with_the_program(base, monkeypatch):
+def test_a_run_that_is_preparing_ends_with_the_program(base, adapter, monkeypatch):
     monkeypatch.setattr(adapting, "GRACE_S", 0.1)
     preparing = threading.Event()
 
@@ -113,7 +118,6 @@ def test_a_run_that_is_preparing_ends_with_the_program(base, monkeypatch):
             time.sleep(0.01)
 
     monkeypatch.setattr(base, "adapt", forever)
-    adapter = Adapter(base, Supersampled("supersampled", base))
     adapter.start(wish(base))
     assert preparing.wait(60) and adapter.picture(base.cameras[0]) is None
     adapter.close()

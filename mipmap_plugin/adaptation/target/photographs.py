@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -12,7 +12,10 @@ from typing import cast
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.target.other_world import doubt_about
 from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.adaptation.warn import warn
+from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.errors import SettingsError, some_of, type_of
 from mipmap_plugin.limits import path_of
@@ -56,6 +59,12 @@ class Photographs:
         if not count:
             raise SettingsError("none of the views that are adapted to has a photograph: take the train views, or leave the images out")
         return f"{count} of them real images"
+
+    def warn_of_others(self, render: Callable[..., Rendered]) -> None:
+        """Warn if the base, by its `render`, does not show what they do (`doubt_about`)."""
+        scene, color, originals = self._scene, self._background, self._originals
+        if doubt := doubt_about(self.cameras, lambda view: scene.image(originals[view], color), render, color, "--images"):
+            warn(doubt)
 
     def __call__(self, view: Camera) -> Tensor | None:
         """Return the image [H, W, 3] of one of `cameras`, shrunk as Pillow does; None for any other view."""

@@ -87,8 +87,8 @@ def write(folder: Folder, tradeoffs: Sequence[Tradeoff], *, complete: bool) -> N
 
     Raises OutputExists, OutputError, and SettingsError without matplotlib.
     """
-    page = page_at(folder.path / PAGE) if (folder.path / NAMES[0]).exists() else []  # else it shows something else, such as a ladder
-    spent = [*page, *([folder.path / KEPT] if complete else [])]
+    older = [*page_at(folder.path / PAGE), folder.path / NAMES[2]] if (folder.path / NAMES[0]).exists() else []  # else the page shows something else
+    spent = [*older, *([folder.path / KEPT] if complete else [])]
     with together(folder.path / NAMES[0], spent):
         write_json(folder.path / NAMES[0], facts(tradeoffs, complete), folder.overwrite)
         _write_table(folder, tradeoffs)

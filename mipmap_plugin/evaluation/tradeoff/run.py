@@ -12,14 +12,15 @@ from mipmap_plugin.evaluation.tradeoff.front import Tradeoff
 from mipmap_plugin.evaluation.tradeoff.measuring import left_out, measure
 from mipmap_plugin.evaluation.tradeoff.points import Plan
 from mipmap_plugin.evaluation.tradeoff.truth import base_itself, photographs
+from mipmap_plugin.progress import note
 from mipmap_plugin.scenes import Scene
-from mipmap_plugin.wrap import Interrupted, Wrapped
+from mipmap_plugin.wrap import Wrapped
 
 
 def run(model: Wrapped, scene: Scene | None, scales: Sequence[float], plan: Plan, views: int | None, folder: Folder) -> list[Tradeoff]:
     """Measure, and write the results to `folder`. `scene`: with photographs to compare with; `views`: maximum number of them.
 
-    Ctrl-C writes the results so far and raises Interrupted. Raises SettingsError, BackendUnavailable, OutputExists and OutputError.
+    Ctrl-C writes the results so far. Raises SettingsError, BackendUnavailable, OutputExists and OutputError.
     """
     if 1 in scales:
         raise SettingsError("at scale 1 the base needs no adaptation; give another scale")
@@ -37,12 +38,9 @@ def run(model: Wrapped, scene: Scene | None, scales: Sequence[float], plan: Plan
             for point in measure(model, truth, tradeoff.scale, plan, cells):
                 tradeoff.points.append(point)
     except KeyboardInterrupt:
-        measured = [tradeoff for tradeoff in tradeoffs if tradeoff.points]
-        if not measured:
-            raise Interrupted("interrupted; nothing was measured yet") from None
-        write(goes_on(folder), measured, complete=False)
-        count = sum(len(tradeoff.points) for tradeoff in measured)
-        again = f"the {plural(count, 'point')} measured so far: {folder.path}; run the same command again to go on"
-        raise Interrupted(f"interrupted; {again}") from None
+        if measured := [tradeoff for tradeoff in tradeoffs if tradeoff.points]:
+            write(goes_on(folder), measured, complete=False)
+            note(f"the {plural(sum(len(tradeoff.points) for tradeoff in measured), 'point')} measured so far: {folder.path}")
+        raise
     write(goes_on(folder), tradeoffs, complete=True)
     return tradeoffs

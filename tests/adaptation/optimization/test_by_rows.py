@@ -65,11 +65,11 @@ def optimizer_of(model, **settings):
     return make_optimizer(model, recipe("default", 1 / 4, **settings), pixel=0.1)
 
 
-def stepped(model, *limits) -> ByRows:
+def stepped(model, limits=None) -> ByRows:
     """The rows of a model after a step."""
     rows = of(model)
     differentiate(rows)
-    rows.step(optimizer_of(model), *limits)
+    rows.step(optimizer_of(model), limits)
     return rows
 
 
@@ -79,14 +79,6 @@ def step_by_rows(model, optimizer, shots=SHOTS):
     differentiate(rows, shots)
     assert all(tensor.grad is None for tensor in model.parameters().values())
     rows.step(optimizer)
-
-
-def test_a_step_leaves_colors_within_limits_and_is_followed_by_one_of_the_same_stepper():
-    model = student()
-    rows = stepped(model, (-0.1, 0.1))
-    colors = model.parameters()["sh0"].detach()
-    assert colors.abs().max() == pytest.approx(0.1) and of(model, rows) is rows
-    torch.testing.assert_close(draw(rows)[0], BACKEND.render(model.gaussians().detach(), *SHOTS[0]).image)
 
 
 def after(steps, **options) -> dict[str, torch.Tensor]:
@@ -203,10 +195,12 @@ def test_quaternions_of_any_length_stay_finite(size):
     assert all(raw.isfinite().all() for raw in model.parameters().values())
 
 
-def test_what_is_drawn_after_a_step_are_the_moved_parameters():
+@pytest.mark.parametrize("limits", [None, (-0.1, 0.1)])
+def test_what_is_drawn_after_a_step_are_the_moved_parameters_with_colors_within_limits(limits):
     model = student()
-    rows = stepped(model)
+    rows = stepped(model, limits)
     assert of(model, rows) is rows
+    assert (model.parameters()["sh0"].abs().max().item() == pytest.approx(0.1)) == bool(limits)
     with torch.no_grad():
         for image, expected in zip(draw(rows), BACKEND.render_views(model.gaussians(), SHOTS), strict=True):
             torch.testing.assert_close(image, expected.image, atol=1e-5, rtol=1e-4)
@@ -222,6 +216,16 @@ def test_changed_parameters_are_activated_anew_to_the_same_bytes():
         assert torch.equal(draw(again)[0], draw(rows)[0])  # so a run can be resumed
     model.replace_parameters(neighbors({name: tensor.detach().clone() for name, tensor in model.parameters().items()}))
     assert of(model, again) not in (None, again)
+
+
+def test_moments_that_an_optimizer_has_forgotten_start_anew():
+    model = student()
+    rows, optimizer = of(model), optimizer_of(model)
+    for _ in range(2):
+        optimizer.state.clear()
+        differentiate(rows)
+        rows.step(optimizer)
+    assert {float(optimizer.state_of(tensor)["step"]) for tensor in model.parameters().values()} == {1.0}
 
 
 def test_only_plain_splats_that_all_move_go_by_rows():

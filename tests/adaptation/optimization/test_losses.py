@@ -4,7 +4,8 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR, compare, gradient_of
+from mipmap_plugin.adaptation.optimization.losses import BEYOND_WHITE, INVISIBLE_ERROR, compare, gradient_of
+from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
@@ -33,6 +34,29 @@ def test_those_of_several_images_are_those_of_each(loss):
         gradient, square_error = gradient_of(difference, loss)
         torch.testing.assert_close(gradients[number], gradient)
         torch.testing.assert_close(square_errors[number], square_error)
+
+
+COMPARED = {
+    "zoom-out": (1 / 4, dict(loss="psnr"), (6, 8), lambda image, truth: image.minimum(truth.clamp_min(1) + BEYOND_WHITE)),
+    "zoom-out by another loss": (1 / 4, dict(loss="l2"), (6, 8), lambda image, truth: image),
+    "zoom-in to the base": (2, dict(loss="psnr", compare_at="base"), (3, 4), lambda image, truth: image.clamp_max(1)),
+    "zoom-in to what is upsampled": (2, dict(loss="psnr", compare_at="target"), (6, 8), lambda image, truth: image),
+}
+
+
+@pytest.mark.parametrize("name", COMPARED)
+@pytest.mark.parametrize("detail", [None, lambda view, image: image.square().mean()], ids=["", "with detail"])
+@pytest.mark.parametrize("count", [1, 2])
+def test_the_gradient_of_an_image_is_that_of_the_loss_of_what_a_display_shows(name, detail, count):
+    scale, settings, size, shown = COMPARED[name]
+    generator, config = torch.Generator().manual_seed(0), AdaptConfig(resize="pil-bicubic", **settings)
+    images = 2.0 * torch.rand(count, 6, 8, 3, generator=generator, dtype=torch.float64)
+    truths = 1.1 * torch.rand(count, *size, 3, generator=generator, dtype=torch.float64)
+    for image, truth, found in zip(images, truths, compare([None] * count, images, truths, config, scale, detail), strict=True):
+        leaf = shown(image, truth).requires_grad_()
+        difference = resize(leaf, size, "pil-bicubic") - truth
+        [gradient] = torch.autograd.grad(DEFINITIONS[config.loss](difference) + (detail(None, leaf) if detail else 0), leaf)
+        torch.testing.assert_close(found, (gradient, difference.detach().square().mean()))
 
 
 def test_an_image_that_is_right_has_no_gradient():

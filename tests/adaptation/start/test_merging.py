@@ -146,9 +146,9 @@ def test_partners_are_found_wherever_the_scene_lies_and_in_whatever_order_it_com
 
 
 @pytest.mark.parametrize("degenerate", [0.0, 1e-30, 1e4])
-def test_scales_of_any_size_give_finite_splats(degenerate):
+def test_scales_of_any_size_and_opaque_splats_give_finite_ones(degenerate):
     odd = cloud(30)
-    odd.scales[::2, 0] = degenerate
+    odd.scales[::2, 0], odd.opacities[::3] = degenerate, 1.0
     left = merged(odd, 0.1)
     assert len(left) < 30
     assert all(field.isfinite().all() for field in (left.means, left.quats, left.scales, left.opacities, left.sh))

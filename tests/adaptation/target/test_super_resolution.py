@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from torch import nn
+from torch_checkpoints import Hostile
 
 from mipmap_plugin.adaptation.target import super_resolution
 from mipmap_plugin.adaptation.target.disk_cache import cache_folder, cached, fingerprint
@@ -76,11 +77,6 @@ def test_a_torchscript_file_is_read_without_being_executed(spandrel, tmp_path, m
     with torch.no_grad():
         expected = network(picture().movedim(-1, 0)[None])[0].movedim(0, -1).clamp(0, 1)
     torch.testing.assert_close(Network(tmp_path / "net.pt")(picture(), (40, 48)), expected, atol=5e-4, rtol=0)
-
-
-class Hostile:
-    def __reduce__(self):
-        return (sys.exit, (1,))
 
 
 def test_what_is_no_enlarging_network_is_refused_in_a_sentence(spandrel, network_file, tmp_path):

@@ -5,16 +5,18 @@ import json
 import re
 import time
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import tiny
 import torch
 
 from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.commands.resuming import resumable
 from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.evaluation.measure import baselines
 from mipmap_plugin.evaluation.tradeoff import measuring
-from mipmap_plugin.evaluation.tradeoff.files import Folder, facts, table
+from mipmap_plugin.evaluation.tradeoff.files import KEPT, Folder, facts, table, write
 from mipmap_plugin.evaluation.tradeoff.front import Tradeoff
 from mipmap_plugin.evaluation.tradeoff.measuring import OBSERVED_STEPS, RENDERERS, measure
 from mipmap_plugin.evaluation.tradeoff.points import Plan
@@ -22,7 +24,7 @@ from mipmap_plugin.evaluation.tradeoff.run import run
 from mipmap_plugin.evaluation.tradeoff.truth import base_itself, photographs
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.screen_filters import SCREEN_FILTERS
-from mipmap_plugin.wrap import Interrupted, wrap_model
+from mipmap_plugin.wrap import wrap_model
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
@@ -258,7 +260,15 @@ def test_json_csv_and_table_hold_every_point(tmp_path):
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["tradeoff.csv", "tradeoff.json"]
 
 
-def test_ctrl_c_keeps_what_was_measured_and_says_where(tmp_path, monkeypatch):
+def test_a_plot_does_not_outlive_its_results(tmp_path):
+    (tmp_path / "tradeoff.png").write_bytes(b"of an earlier command")
+    write(Folder(tmp_path, picture=False, overwrite=True), [], complete=True)
+    assert (tmp_path / "tradeoff.png").exists()  # there are no results that it is of
+    write(Folder(tmp_path, picture=False, overwrite=True), [], complete=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["tradeoff.csv", "tradeoff.json"]
+
+
+def test_ctrl_c_keeps_what_was_measured_and_says_where(tmp_path, monkeypatch, capsys):
     left = iter(range(4))
 
     def tired(point, show, yardstick, repeats, judged=measuring._measured):
@@ -267,18 +277,16 @@ def test_ctrl_c_keeps_what_was_measured_and_says_where(tmp_path, monkeypatch):
         return judged(point, show, yardstick, repeats)
 
     monkeypatch.setattr(measuring, "_measured", tired)
-    with pytest.raises(Interrupted, match=f"the 4 points measured so far: {tmp_path}"):
+    with pytest.raises(KeyboardInterrupt), resumable(tmp_path / KEPT, "cell"):
         run(wrapped(), None, [1 / 4, 4], PLAN, 1, Folder(tmp_path, picture=False, overwrite=False))
+    assert f"the 4 points measured so far: {tmp_path}" in capsys.readouterr().err
     told = json.loads((tmp_path / "tradeoff.json").read_text())
     assert not told["complete"] and [len(each["points"]) for each in told["scales"]] == [4]
 
 
 def test_ctrl_c_before_the_first_point_writes_nothing(tmp_path, monkeypatch):
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(measuring, "_measured", stop)
-    with pytest.raises(Interrupted, match="nothing was measured yet"):
+    monkeypatch.setattr(measuring, "_measured", Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
         run(wrapped(), None, [1 / 4], PLAN, 1, Folder(tmp_path / "new", picture=False, overwrite=False))
     assert not (tmp_path / "new").exists()
 

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from unittest.mock import Mock
 
 import pytest
 import tiny
@@ -55,11 +56,8 @@ def test_pictures_without_matplotlib_are_refused_before_anything_is_measured(tmp
 
 
 def test_a_page_that_cannot_be_written_is_written_by_the_same_command(tmp_path, capsys, monkeypatch):
-    def full(*_):
-        raise OutputError("the disk is full")
-
     with monkeypatch.context() as failing:
-        failing.setattr("mipmap_plugin.pages.html.write_page", full)
+        failing.setattr("mipmap_plugin.pages.html.write_page", Mock(side_effect=OutputError("the disk is full")))
         assert command(tmp_path, "--report") == 2 and "the disk is full" in capsys.readouterr().err
     assert {path.name for path in (tmp_path / "new").iterdir()} == {"tradeoff.resume"}
     monkeypatch.setattr(measuring, "adapt_alone", lambda *_, **__: pytest.fail("what was measured is kept"))

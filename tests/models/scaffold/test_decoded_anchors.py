@@ -34,8 +34,9 @@ def test_a_training_view_sees_its_own_appearance(tmp_path):
     view = replace(VIEWS[0], index=3)
     model = load(tmp_path, layout)
     agrees(model.gaussians(view), oracle.decode(checkpoints.columns(layout), states, layout, view, states["appearance"]["embedding.weight"][3]))
-    with pytest.raises(SettingsError, match="index 5, but the model has the appearance of 5"):
-        model.gaussians(replace(view, index=5))
+    for index in (5, -1):
+        with pytest.raises(SettingsError, match=f"index {index}, but the model has the appearance of 5"):
+            model.gaussians(replace(view, index=index))
 
 
 @pytest.mark.parametrize("size", [(48, 36), (5, 3), (17, 16)])
@@ -46,6 +47,7 @@ def test_the_prefilter_is_the_originals(size):
     position, rotation = (torch.from_numpy(np.stack([columns[name] for name in names], 1)) for names in ("xyz", [f"rot_{i}" for i in range(4)]))
     scales = torch.from_numpy(np.stack([columns[f"scale_{i}"] for i in range(3)], 1)).exp()
     position = position * 4
+    position[:20] = (view.center + torch.linspace(0.05, 0.4, 20)[:, None] * view.viewmat[2, :3]).float()  # on either side of the near plane
     seen = in_view(position, scales, torch.nn.functional.normalize(rotation), view)
     rows = [{**{name: float(column[i]) for name, column in columns.items()}} for i in range(400)]
     wanted = [oracle.visible(row, position[i].double().numpy(), view) for i, row in enumerate(rows)]

@@ -59,6 +59,7 @@ def test_double_columns_beyond_float32_are_dropped_not_spread(tmp_path):
     columns["x"][1] = 1e300
     assert len(load_vanilla(write(tmp_path / "a.ply", columns))) == 2
 
+
 @pytest.mark.parametrize("full", [np.uint8(255), np.uint16(65535)])
 def test_opacities_that_are_whole_numbers_are_fractions_and_no_logits(tmp_path, full):
     path = write(tmp_path / "a.ply", {**splat_columns(3), "opacity": np.array([0, full // 5, full], full.dtype)})
@@ -66,7 +67,6 @@ def test_opacities_that_are_whole_numbers_are_fractions_and_no_logits(tmp_path, 
     torch.testing.assert_close(model.gaussians().opacities, torch.tensor([OPACITY_MARGIN, 0.2, 1 - OPACITY_MARGIN]))
     assert f"its opacities are whole numbers ({full.dtype}), read as fractions of the largest" in model.notes
     assert "opacity" not in model.extras
-
 
 
 @pytest.mark.parametrize("form", ["binary_little_endian", "binary_big_endian", "ascii"])

@@ -1,13 +1,9 @@
 """Screen gradients, by which density control grows splats: right, and averaged over the views that gave any."""
 
-
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.optimization.density import (
-    ScreenGradients,
-    strongest,
-)
+from mipmap_plugin.adaptation.optimization.density import ScreenGradients, strongest
 from mipmap_plugin.adaptation.optimization.loop import adapt as optimize
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.validation import Validation
