@@ -32,6 +32,7 @@ from mipmap_plugin.models.live import adopt
 from mipmap_plugin.process.threads import checked as checked_threads
 from mipmap_plugin.process.torch_modes import in_usual_modes
 from mipmap_plugin.scenes import Scene, load_scene
+from mipmap_plugin.scenes.cameras_json import WIDTH_CAP
 from mipmap_plugin.scenes.orbits import AXES
 from mipmap_plugin.screen_filters import USUAL_EPS2D, check_screen_filter
 
@@ -128,10 +129,22 @@ def _found(model: SplatModel, cameras: Sequence[Camera] | Scene | str | Path | N
         if cameras.is_capture and (project := exporter(model.source)):
             frames = f"{model.source} is in the frame that {project} trained in, and {cameras.source} most often in another: views may show nothing"
             warn(f"{frames}; {REMEDIES[project]}")
+        if doubt := _of_unknown_size(model, cameras):
+            warn(doubt)
         return cameras, where(cameras.source, model.folder)
     if cameras is not None:
         return of_base_scale(cameras), {}
     return own_cameras(model.source, model.folder)
+
+
+def _of_unknown_size(model: SplatModel, scene: Scene) -> str:
+    """That a capture has larger views than many trainings take, and no file says the size of this model's, in a sentence; "" else."""
+    largest = max(scene.cameras, key=lambda camera: camera.width, default=None)
+    if largest is None or largest.width <= WIDTH_CAP or not scene.is_capture or model.traits.placed or read_options(model.folder)[0]:
+        return ""
+    size = f"{scene.source} has views of {largest.width} x {largest.height} px, which is taken to be the size of the training"
+    smaller = f"unless told otherwise 3DGS makes them {WIDTH_CAP} px wide, and Brush at most 1920 px long"
+    return f"{size}, but {smaller}: if it was so, give a copy of the scene whose folder images has the photographs at that size"
 
 
 def _warn_of_others(wrapped: Wrapped, scene: Scene) -> None:

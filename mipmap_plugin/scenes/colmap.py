@@ -16,7 +16,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError, brief, plural, some_of, warn
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import pixels
-from mipmap_plugin.scenes.base import ABSENT, SPLIT, Scene, note_on_shapes, other_shape
+from mipmap_plugin.scenes.base import ABSENT, MASKED, SPLIT, Scene, note_on_shapes, other_shape
 from mipmap_plugin.scenes.cameras_json import TEST_EVERY, numbers_views, photographs_folder, tests_by_lod, trained_size
 from mipmap_plugin.scenes.colmap_sizes import refuse_truncated
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, note
@@ -30,6 +30,9 @@ MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".", "0")  # the last: the fo
 
 # Folders between a model and the folder of photographs, which is beside the highest: nerfstudio has all of them.
 BETWEEN = ("0", "sparse", "colmap")
+
+# Folders beside that of photographs: of masks, as Brush reads them, and of what 3DGS's convert.py undistorts.
+MASKS, BENT = "masks", "input"
 
 # An option in the cfg_args of Scaffold-GS and Octree-GS, and one of 4DGaussians; and the lenses that bend which these take for pinholes.
 UNBENT = {"n_offsets": ("SIMPLE_RADIAL",), "kplanes_config": ("SIMPLE_RADIAL", "OPENCV")}
@@ -233,5 +236,9 @@ def _notes(cameras: list[Camera], photographs: dict[Camera, Path], folder: Path,
     notes = [f"{plural(len(cameras), 'camera')} in the order of their names: {tests} {SPLIT}, the others for training"]
     if absent := len(cameras) - len(photographs):
         gone = some_of(absent, len(cameras), "photograph", "are")
-        notes.append(f"{gone} {ABSENT} from {folder}, though the COLMAP model names {'it' if absent == 1 else 'them'}")
+        redo = f"; {BENT} is what convert.py of 3DGS undistorts: run it again, or rename it to {WHOLE} if the model is of these themselves"
+        bent = redo if folder.with_name(BENT).is_dir() and not photographs else ""
+        notes.append(f"{gone} {ABSENT} from {folder}, though the COLMAP model names {'it' if absent == 1 else 'them'}{bent}")
+    if photographs and (masks := folder.with_name(MASKS)).is_dir():
+        notes.append(f"photographs may be {MASKED} ({masks}); masks are not read, so that what they hide counts like all else")
     return notes

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import pytest
 import tiny
+import torch
 
 from mipmap_plugin.errors import SceneError
-from mipmap_plugin.scenes import load_scene, read_cameras, read_transforms, write_cameras
+from mipmap_plugin.scenes import Scene, load_scene, read_cameras, read_transforms, write_cameras
 from mipmap_plugin.wrap import wrap_model
 
 POSE = [[1, 0, 0, 1.0], [0, 1, 0, 2.0], [0, 0, 1, 3.0], [0, 0, 0, 1]]
@@ -137,3 +138,18 @@ def test_cameras_of_a_capture_are_in_another_frame_than_what_opensplat_writes(tm
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         wrap_model(made, cameras=write_cameras(tmp_path / "own.json", tiny.cameras(2)))
+
+
+@pytest.mark.parametrize(("width", "told"), [(1600, False), (1601, True)])
+def test_a_capture_larger_than_trainings_take_is_told_of_where_nothing_says_their_size(tmp_path, width, told):
+    """By default 3DGS makes pictures 1600 px wide (utils/camera_utils.py), Brush at most 1920 px long (crates/brush-dataset/src/config.py)."""
+    cameras = tuple(camera.resized(width, 1200) for camera in tiny.cameras(2))
+    scene, ply = Scene(cameras, {}, tmp_path, points=torch.zeros(1, 3)), tiny.ply(tmp_path / "base.ply")
+    folder = tiny.folder(tmp_path / "model")
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        wrap_model(ply, cameras=list(cameras))
+        wrap_model(folder, cameras=scene)  # has cfg_args
+        assert not found
+        wrap_model(ply, cameras=scene)
+    assert [f"views of {width} x 1200 px, which is taken to be the size of the training" in str(each.message) for each in found] == [True] * told

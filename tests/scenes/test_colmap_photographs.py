@@ -127,6 +127,25 @@ def test_photographs_that_are_nowhere_are_missed_beside_the_model(tmp_path):
         assert f"absent from {tmp_path / 'scene/images'}," in " ".join(load_scene(tmp_path / folder).notes)
 
 
+def test_the_folder_that_convert_py_undistorts_is_named_where_its_outcome_is_absent(tmp_path):
+    """convert.py of 3DGS undistorts `input` to `images`, to which the model in `sparse` belongs."""
+    write_text_model(tmp_path / "sparse/0", names(2))
+    write_photographs(tmp_path / "input", names(2))
+    [warning] = load_scene(tmp_path).warnings()
+    assert "input is what convert.py of 3DGS undistorts: run it again, or rename it to images" in warning
+    write_photographs(tmp_path / "images", names(2))
+    assert not load_scene(tmp_path).warnings()
+
+
+def test_masks_beside_photographs_are_told_of_for_they_are_not_read(tmp_path):
+    """Brush reads them (crates/brush-dataset/src/formats/mod.rs, find_mask_path)."""
+    write_text_model(tmp_path / "sparse/0", names(2))
+    write_photographs(tmp_path / "images", names(2))
+    (tmp_path / "masks").mkdir()
+    masked = f"photographs may be masked ({tmp_path / 'masks'}); masks are not read, so that what they hide counts like all else"
+    assert load_scene(tmp_path).warnings() == [masked]
+
+
 def test_a_real_capture_of_which_most_photographs_are_absent(shared_data):
     scene = load_scene(shared_data / "colmap/llff_small")
     assert (len(scene.cameras), len(scene.images), len(scene.split("test"))) == (184, 31, 23)

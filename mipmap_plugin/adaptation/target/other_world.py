@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import chain
 from statistics import fmean
 
 import torch
@@ -42,10 +43,11 @@ def doubt_about(
     cameras = _from_different_places(evenly(cameras, MOST_VIEWS))
     if len(cameras) < 2:
         return ""
-    photographs = [photograph(camera).cpu() for camera in cameras]
-    factor = min(1.0, min(LOOK, *photographs[0].shape[:2]) / min(cameras[0].size))
+    first = photograph(cameras[0])
+    factor = min(1.0, min(LOOK, *first.shape[:2]) / min(cameras[0].size))
     size = cameras[0].zoomed(factor).size
-    truths = [resize(image, size, "area") for image in photographs]  # some are a pixel wider, or taken upright
+    each_alone = chain([first], map(photograph, cameras[1:]))  # for one may have 100 megapixels
+    truths = [resize(image.cpu(), size, "area") for image in each_alone]  # some are a pixel wider, or taken upright
     total = torch.stack(truths).sum(0)
     others = [(total - truth) / (len(truths) - 1) for truth in truths]
     by_others = fmean(map(psnr_as_shown, others, truths))
