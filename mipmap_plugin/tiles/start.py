@@ -12,10 +12,11 @@ from mipmap_plugin.adaptation.optimization.validation import mean_db
 from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS, pixel_size, views_for
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.blend_weights import may_show, whole_weights
-from mipmap_plugin.adaptation.start.candidates import mildest_costs, start_name
+from mipmap_plugin.adaptation.start.candidates import start_name
 from mipmap_plugin.adaptation.start.closed_form import FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import matched_opacities
 from mipmap_plugin.adaptation.start.merging import merge_seen
+from mipmap_plugin.adaptation.start.strength import POWERS, mildest_costs, strongest
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.gaussians import Gaussians
@@ -25,9 +26,6 @@ from mipmap_plugin.tiles.scene import TiledScene
 from mipmap_plugin.tiles.splats import Splats
 from mipmap_plugin.tiles.store import Store, write_store
 from mipmap_plugin.tiles.truth import Truths
-
-# The roots of `merge_to` that are tried, as without tiles (`candidates.POWERS`): the last, the mildest, and then the others.
-ROOTS = (1, 2, 4)
 
 CANDIDATES = ("formed", "mildest", "merged")  # names of their files
 
@@ -69,24 +67,19 @@ class StartSearch:
         return weights * scene.scale**2
 
     def _takes_merged(self, weights: Tensor, formed_db: float, base_db: float) -> bool:
-        """Take the strongest merging that costs little, and return whether there is one; where the mildest costs too much, no other is tried."""
+        """Take the strongest merging that costs little, and return whether there is one."""
         scene, config = self.scene, self.scene.config
 
-        def tried(name: str, root: int, costs: float) -> tuple[float, bool]:
-            self._candidate(name, weights, config.merge_to ** (1 / root))
+        def tried(power: float) -> tuple[tuple[str, float], float, bool]:
+            mildest = power == POWERS[-1]
+            name, costs = ("mildest", mildest_costs(config, scene.base_effects, scene.target)) if mildest else ("merged", config.merging_costs)
+            self._candidate(name, weights, config.merge_to**power)
             psnr = self.steer(self._open(name))
-            return psnr, psnr >= max(formed_db - costs, base_db)
+            return (name, psnr), psnr, psnr >= max(formed_db - costs, base_db)
 
-        title = start_name(self.forms, merged=True)
-        mildest_db, suits = tried("mildest", ROOTS[-1], mildest_costs(config, scene.base_effects, scene.target))
-        for root in ROOTS[:-1] if suits or mildest_db >= formed_db else ():
-            merged_db, is_taken = tried("merged", root, config.merging_costs)
-            if is_taken:
-                self._take("merged", title, merged_db)
-                return True
-        if suits:
-            self._take("mildest", title, mildest_db)
-        return suits
+        if found := strongest(tried, formed_db):
+            self._take(found[0], start_name(self.forms, merged=True), found[1])
+        return found is not None
 
     def steer(self, splats: Splats) -> float:
         """PSNR (dB) on the steering views."""

@@ -20,24 +20,17 @@ from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings,
 from mipmap_plugin.adaptation.start.matching import ROUNDS, matched_opacities
 from mipmap_plugin.adaptation.start.merging import Rounds, merge_down, merge_seen
 from mipmap_plugin.adaptation.start.problem import StartProblem
+from mipmap_plugin.adaptation.start.strength import POWERS, mildest_costs, strongest
 from mipmap_plugin.adaptation.start.thinning import evenly_in_space, least_fraction
 from mipmap_plugin.camera import evenly
-from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.effects import SURFEL, Effects
+from mipmap_plugin.effects import SURFEL
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SPLATS, SplatModel, Thinned, places
 from mipmap_plugin.models.contract import rebuild, reshape
 from mipmap_plugin.screen_filters import INTEGRATED
 
-# The powers of `merge_to` that are tried: the last, the mildest, and then the others, until merging loses little enough.
-POWERS = (1, 1 / 2, 1 / 4)
-
 # Crispnesses also tried where a zoom-in below CRISPER_BELOW takes no steps: from there on the softest always looks best, shrunk, even of thin wires.
 CRISPER, CRISPER_BELOW = (0.5, 1.0), 2.0
-
-# dB that the mildest merging may cost before steps for a renderer that draws otherwise than the training did, even if the settings allow less: fewer
-# splats learn that sooner, and better. What stronger merging costs does not come back (docs/recipes_found.md).
-MILD_COSTS = 0.6
 
 # The powers that are tried before those for a start from a finer level, whose splats are merged even where too few share a pixel: otherwise chair
 # would keep half of them at x0.57. The result has to have LEAST_DB: from 29 dB steps regained all that merging had cost, from 20 dB a third.
@@ -92,12 +85,6 @@ def best_start(problems: Sequence[StartProblem]) -> tuple[SplatModel, str, list[
     start, name, _ = max(found, key=lambda each: problems[0].quality(each[0]).visible) if len(found) > 1 else found[0]
     told = f"{name} without the conversion" if start is not found[0][0] else name
     return start, told, [note for *_, notes in found for note in notes]
-
-
-def mildest_costs(config: AdaptConfig, base: Effects, target: Effects) -> float:
-    """dB that the mildest merging may cost."""
-    learns = config.steps > 0 and base != target and config.merging_costs
-    return max(config.merging_costs, MILD_COSTS) if learns else config.merging_costs
 
 
 class StartSearch:
@@ -189,28 +176,21 @@ class StartSearch:
         return max(least, (formed.psnr + problem.quality(problem.coarse_base()).psnr) / 2)
 
     def _merged(self, weights: Tensor | None, bounds: Bounds, coarse_bounds: Bounds | None) -> SplatModel | None:
-        """The candidate of the strongest merging within the bounds; None if merging costs too much.
-
-        If the mildest merging already loses too much, as with captures, no stronger one is tried. If the mildest gains, a stronger one is tried
-        even where the base as it is looks better, since it may be better than both.
-        """
+        """The candidate of the strongest merging within the bounds; None if merging costs too much."""
         for power in COARSE_POWERS if coarse_bounds else ():
             if not self._clock.allows("candidate", self._fraction(power)):
                 break
             coarse, quality = self._tried(weights, power, coarsely=True)
             if coarse_bounds and coarse_bounds.hold_for(quality):
                 return coarse
-        if not self._clock.allows("candidate", self._fraction(POWERS[-1])):
-            return None
-        mildest, quality = self._tried(weights, POWERS[-1])
-        suits = bounds.hold_for(quality, self._more_costs)
-        for power in POWERS[:-1] if suits or quality.psnr >= bounds.formed else ():
+
+        def tried(power: float) -> tuple[SplatModel, float, bool] | None:
             if not self._clock.allows("candidate", self._fraction(power)):
-                break
-            merged, quality = self._tried(weights, power)
-            if bounds.hold_for(quality):
-                return merged
-        return mildest if suits else None
+                return None
+            candidate, quality = self._tried(weights, power)
+            return candidate, quality.psnr, bounds.hold_for(quality, self._more_costs if power == POWERS[-1] else 0.0)
+
+        return strongest(tried, bounds.formed)
 
     def _tried(self, weights: Tensor | None, power: float, coarsely: bool = False) -> tuple[SplatModel, Quality]:
         """A candidate and its quality."""
