@@ -14,6 +14,7 @@ from mipmap_plugin.camera import evenly
 from mipmap_plugin.evaluation.measure import resized_base, views_seen
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.protocols import Protocol, TruthView
+from mipmap_plugin.models.adapted_scale import adapted_scale
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.scenes.cameras_json import photographs_folder, trained_size
@@ -39,7 +40,8 @@ def of_another_scene(model: Wrapped, views: Sequence[TruthView], scale: float, p
     truths = [resize(view.truth(scale, protocol), size, "bilinear") for view in views]  # some are a pixel wider, or taken upright
     total = torch.stack(truths).sum(0)
     by_others = fmean(psnr((total - truth) / (len(truths) - 1), truth) for truth in truths)
-    shown = (resized_base(model.render(view.camera).image, size, shrink_by=protocol.shrink_by) for view in views)
+    own = adapted_scale(model.model.source) or 1.0  # at which alone an adapted file looks right
+    shown = (resized_base(model.render(view.camera.zoomed(own), own).image, size, shrink_by=protocol.shrink_by) for view in views)
     by_base = fmean(psnr(image.to(truth), truth) for image, truth in zip(shown, truths, strict=True))
     if by_base > by_others:
         return ""
