@@ -61,6 +61,10 @@ EXAMPLES = {
 }
 
 
+# A word with one dash that is neither -h, a number, nor a direction of --up.
+DASHED = re.compile(r"-(?!h$|[xyz]$|inf|nan)[^-\d.]")
+
+
 def _alone(command: Callable[..., None]) -> Callable[..., None]:
     """The command, while which nothing else prints to standard output (`voice.alone`); its help, which tyro prints, comes before."""
 
@@ -82,6 +86,9 @@ def _parse(words: Sequence[str]) -> None:
     command's own help, and suggests no option of another command."""
     if any(not word or re.fullmatch("--[^=]+=", word) for word in words):  # "" would be a path, to this folder
         raise SettingsError("a word of this command is empty, as where a variable of the shell is not set; fill it in, or leave it out")
+    options = words[: words.index("--")] if "--" in words else words  # behind it are names of files
+    if dashed := next((word for word in options if DASHED.match(word)), None):
+        raise SettingsError(f"{dashed} begins with a dash, as options do; give a path as ./{dashed}")
     if words and (command := COMMANDS.get(words[0])):
         refuse_repeated(command, words)
         prog, summary = f"mipmap-plugin {words[0]}", (getdoc(command) or "").partition("\n\nArgs:")[0]

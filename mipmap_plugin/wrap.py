@@ -97,7 +97,7 @@ def wrap_model(
     found, read_from = _found(model, cameras)
     given = found.cameras if isinstance(found, Scene) else found
     if up is not None and given:
-        warn(f"up {up}: there are cameras, whose views are taken; it is of use only where an orbit is asked for (views 'orbit')")
+        warn(f"up {up}: there are cameras, whose views are taken unless an orbit is asked for (views 'orbit'); only then it is of use")
     there = placed(model, found) if isinstance(found, Scene) else None
     wrapped = Wrapped(model, there.cameras if there else given, backend, trained, threads)
     wrapped.loading_s, wrapped.asked, wrapped.cameras_from = loading_s, asked_for(model.folder, given, color, screen_filter, up), read_from

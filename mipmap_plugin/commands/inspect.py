@@ -143,11 +143,11 @@ def _advice(wrapped: Wrapped, checkpoint: Path, given: Path | None) -> str:
     """The next command for a sound checkpoint, with what this one was told. `given`: where its cameras lie."""
     from mipmap_plugin.scenes import unread_cameras
 
+    named = f"./{checkpoint}" if str(checkpoint).startswith("-") else str(checkpoint)  # or it would be taken for an option
     if _adapted_to(wrapped) is not None:  # the scale that it is drawn at unless another is given
         own = [] if given is None else ["--cameras", str(given)]
-        return shlex.join(["mipmap-plugin", "render", str(checkpoint), "--output", "DIR", *own])
-    place = shlex.quote(str(checkpoint))
-    words = ["mipmap-plugin", "adapt", place, "--scale", "1/4"]
+        return shlex.join(["mipmap-plugin", "render", named, "--output", "DIR", *own])
+    words = ["mipmap-plugin", "adapt", shlex.quote(named), "--scale", "1/4"]
     if told := wrapped.asked["screen filter"]:
         words += ["--screen-filter", told]
     if given is None and not wrapped.cameras and (up := wrapped.asked.get("up")):

@@ -26,7 +26,7 @@ from mipmap_plugin.errors import TEMPORARY, SettingsError, warn
 from mipmap_plugin.formats.atomic import new_folder, write_json
 from mipmap_plugin.formats.splat_transform import LOD_META
 from mipmap_plugin.formats.streamed_sog import Chunk, read_chunks, write_streamed_sog
-from mipmap_plugin.levels.distance.chunks import shrunk
+from mipmap_plugin.levels.distance.chunks import box_distances, shrunk
 from mipmap_plugin.levels.exported import readable
 from mipmap_plugin.levels.manifest import CANVAS, read_manifest
 from mipmap_plugin.models import load_model
@@ -75,14 +75,13 @@ class Approach:
     def to(cls, middle: Tensor, chunks: Sequence[Chunk]) -> Approach:
         """To the `middle` [3] of the finest level's splats, world units."""
         low, high = (torch.tensor([getattr(chunk, end) for chunk in chunks], dtype=torch.float64) for end in ("low", "high"))
-        center, half = (low + high) / 2, shrunk((high - low) / 2)
         splats = torch.tensor([chunk.splats[0] for chunk in chunks], dtype=torch.float64)
-        return cls(middle.double(), center - half, center + half, splats)
+        return cls(middle.double(), *shrunk(low, high), splats)
 
     def chunk_distance(self, distance: float) -> float:
         """The distance of the chunks from a camera so far from the middle, world units: the median over splats and directions."""
         eyes = self.middle + distance * DIRECTIONS
-        away = torch.maximum(self.low - eyes[:, None], eyes[:, None] - self.high).clamp_min(0).norm(dim=2)  # [D, C]
+        away = box_distances(self.low, self.high, eyes)  # [D, C]
         rising, order = away.flatten().sort()
         reached = self.splats.expand(len(eyes), -1).flatten()[order].cumsum(0)
         return float(rising[int(torch.searchsorted(reached, reached[-1] / 2))])

@@ -26,7 +26,7 @@ def walks_page(title: str, ladder: Contents, manifest: dict[str, Any], commands:
     """The page of a ladder and its manifest (`levels.distance.manifest`): pictures of a walk where it begins, where what is nearest is in the middle
     of each level, and at the end."""
     scene, walks, zooms = ladder.scene, Walks(ladder.scene, [level.model for level in ladder.levels]), dict[float, Zoom]()
-    curve = list(zip(walks.places(), ladder.curve, strict=True))
+    curve = list(zip(walks.sizes(), ladder.curve, strict=True))
     middles = {scene.rule.middle(number) for number in range(scene.rule.count + scene.rule.left_out)}
     for size, point in [curve[0], *(each for each in curve if each[0] in middles), curve[-1]]:
         seen = walks.seen(walks.views[0], size)

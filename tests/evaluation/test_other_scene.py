@@ -46,6 +46,13 @@ def test_evaluate_tells_of_photographs_of_another_scene(tmp_path, capsys, seed, 
     assert (DOUBT in capsys.readouterr().err) == told
 
 
+def test_an_adapted_file_is_not_doubted_for_what_it_shows_at_another_scale(tmp_path, capsys):
+    base, images = tiny.folder(tmp_path / "base"), tiny.scene(tmp_path / "scene", tiny.cameras(4, seed=9, split="test"))
+    assert main(["adapt", str(base), "--scale", "1/4", "--recipe", "instant", "--output", str(tmp_path / "adapted")]) == 0
+    assert main(["evaluate", str(tmp_path / "adapted"), "--images", str(images), "--scale", "1/4", "--no-report"]) == 0
+    assert DOUBT not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("seed", "told"), [(0, False), (5, True)], ids=["its own scene", "another"])
 def test_a_tradeoff_tells_of_them_too(tmp_path, base, recwarn, seed, told):
     photographs(base, load_scene(tiny.scene(tmp_path / "scene", tiny.cameras(4, seed=9, split="test"), seed=seed)), 1 / 2, None)

@@ -155,8 +155,9 @@ def test_one_large_splat_hardly_enlarges_a_box():
 
 def test_of_two_boxes_the_larger_is_the_usual_one():
     """As in PlayCanvas, whose median of an even number is the upper one."""
-    assert shrunk(torch.tensor([[1.0, 1, 1], [5, 5, 5]])).tolist() == [[1, 1, 1], [5, 5, 5]]
-    assert shrunk(torch.tensor([[1.0, 1, 1], [1, 1, 1], [5, 5, 5]]))[2].tolist() == [2, 2, 2]
+    half = torch.tensor([[1.0, 1, 1], [1, 1, 1], [5, 5, 5]])
+    assert torch.equal(shrunk(-half[1:], half[1:])[1], half[1:])
+    assert [corners[2].tolist() for corners in shrunk(-half, half)] == [[-2, -2, -2], [2, 2, 2]]
 
 
 def test_splats_in_one_place_are_one_chunk():
@@ -253,8 +254,8 @@ def test_a_place_is_measured_once_where_levels_end_before_walks_begin(small_chun
     """The nearest parts of this scene are nearer than what most views have before them."""
     scene = scene_in(base := wrapped(), ratio=1.3)
     walks = Walks(scene, [base.model] * scene.rule.count)
-    pixels = [[walks.seen(view, size).pixel for view in walks.views] for size in walks.places()]
-    assert len(walks.places()) < 1 + 2 * scene.rule.count and walks.places()[0] == 0
+    pixels = [[walks.seen(view, size).pixel for view in walks.views] for size in walks.sizes()]
+    assert len(walks.sizes()) < 1 + 2 * scene.rule.count and walks.sizes()[0] == 0
     assert all(any(one < other for one, other in zip(*pair, strict=True)) for pair in pairwise(pixels))
 
 

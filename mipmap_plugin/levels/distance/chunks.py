@@ -59,8 +59,7 @@ class Chunks:
         lows, highs = means - reach, means + reach
         low = torch.stack([lows[rows].amin(0) for rows in leaves])
         high = torch.stack([highs[rows].amax(0) for rows in leaves])
-        middle, half = (low + high) / 2, shrunk((high - low) / 2)
-        return cls(cuts, middle - half, middle + half)
+        return cls(cuts, *shrunk(low, high))
 
     def __len__(self) -> int:
         return len(self.low)
@@ -81,12 +80,19 @@ class Chunks:
 
     def distances(self, eye: Tensor) -> Tensor:
         """The distance from the eye [3] to the nearest point of each box, [C]; 0 inside."""
-        eye = eye.to(self.low)
-        away: Tensor = torch.maximum(self.low - eye, eye - self.high).clamp_min(0).norm(dim=1)
-        return away
+        return box_distances(self.low, self.high, eye.to(self.low))
 
 
-def shrunk(half: Tensor) -> Tensor:
-    """Half extents [C, 3] of the boxes that PlayCanvas measures distances to, from those of the chunks' own boxes [C, 3] (`SHRINK`)."""
+def box_distances(low: Tensor, high: Tensor, eyes: Tensor) -> Tensor:
+    """The distance from eyes [..., 3] to the nearest point of each box between corners [C, 3], [..., C]; 0 inside."""
+    eyes = eyes[..., None, :]
+    away: Tensor = torch.maximum(low - eyes, eyes - high).clamp_min(0).norm(dim=-1)
+    return away
+
+
+def shrunk(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """The boxes that PlayCanvas measures distances to, as corners [C, 3], from those of the chunks' own boxes [C, 3] (`SHRINK`)."""
+    middle, half = (low + high) / 2, (high - low) / 2
     usual = half.sort(dim=0).values[len(half) // 2]
-    return half - SHRINK * (half - usual).clamp_min(0)
+    half = half - SHRINK * (half - usual).clamp_min(0)
+    return middle - half, middle + half

@@ -77,12 +77,12 @@ class Walks:
         truth, mixture, base = self._truth.make(camera, view), self._draw(shown, camera), self._draw(self._scene.splats, camera)
         return Seen((depth + way) / focal_of(view), way, truth, mixture, base, len(shown))
 
-    def places(self) -> list[float]:
+    def sizes(self) -> list[float]:
         """Where walks are looked at, as rising sizes of a pixel at what is nearest: 0, where they begin, then the middle and the end of each level.
 
         Places before the beginning of all walks, where the first levels may end, are left out: they would show the same pictures again.
         """
-        return [0.0, *(size for size in places(self._scene.rule) if any(self._way(view, size) for view in self.views))]
+        return [0.0, *(size for size in sizes(self._scene.rule) if any(self._way(view, size) for view in self.views))]
 
     def _way(self, view: Camera, size: float) -> float:
         """How far back, in world units, a pixel at what is nearest has this size; 0 where it has at least that as the walk begins."""
@@ -96,7 +96,7 @@ class Walks:
         return self._scene.backend.render(splats, camera, self._scene.target).image.clamp(0, 1)
 
 
-def places(rule: DistanceRule) -> list[float]:
+def sizes(rule: DistanceRule) -> list[float]:
     """The middle and the end of each level, left out or not: sizes of a pixel at what is nearest, rising."""
     return [size for number in range(rule.count + rule.left_out) for size in (rule.middle(number), rule.ends(number)[1] * WITHIN)]
 
@@ -104,7 +104,7 @@ def places(rule: DistanceRule) -> list[float]:
 def measured(scene: Scene, levels: Sequence[SplatModel]) -> list[WalkPoint]:
     """The quality at all places of the walks, in their order."""
     walks, points = Walks(scene, levels), []
-    for size in walks.places():
+    for size in walks.sizes():
         rows = [_compared(walks.seen(view, size)) for view in walks.views]
         nearest, dbs, base_dbs, counts = (fmean(column) for column in zip(*rows, strict=True))
         points.append(WalkPoint(nearest, int(scene.rule.level(torch.tensor([nearest]))), dbs, base_dbs, counts))
