@@ -26,7 +26,7 @@ from mipmap_plugin.tiles.splats import Splats
 from mipmap_plugin.tiles.store import Store, write_store
 from mipmap_plugin.tiles.truth import Truths
 
-# The roots of `merge_to` that are tried, as without tiles (`candidates.POWERS`): the last, the mildest, and then the others.
+# The roots of `merge_to` that are tried, as without tiles (`strength.POWERS`): the last, the mildest, and then the others.
 ROOTS = (1, 2, 4)
 
 CANDIDATES = ("formed", "mildest", "merged")  # names of their files

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple, cast
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings,
 from mipmap_plugin.adaptation.start.matching import ROUNDS, matched_opacities
 from mipmap_plugin.adaptation.start.merging import Rounds, merge_down, merge_seen
 from mipmap_plugin.adaptation.start.problem import StartProblem
+from mipmap_plugin.adaptation.start.strength import POWERS, Bounds, Merger
 from mipmap_plugin.adaptation.start.thinning import evenly_in_space, least_fraction
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.config import AdaptConfig
@@ -29,9 +30,6 @@ from mipmap_plugin.models.base import SPLATS, SplatModel, Thinned, places
 from mipmap_plugin.models.contract import rebuild, reshape
 from mipmap_plugin.screen_filters import INTEGRATED
 
-# The powers of `merge_to` that are tried: the last, the mildest, and then the others, until merging loses little enough.
-POWERS = (1, 1 / 2, 1 / 4)
-
 # Crispnesses also tried where a zoom-in below CRISPER_BELOW takes no steps: from there on the softest always looks best, shrunk, even of thin wires.
 CRISPER, CRISPER_BELOW = (0.5, 1.0), 2.0
 
@@ -39,9 +37,8 @@ CRISPER, CRISPER_BELOW = (0.5, 1.0), 2.0
 # splats learn that sooner, and better. What stronger merging costs does not come back (docs/recipes_found.md).
 MILD_COSTS = 0.6
 
-# The powers that are tried before those for a start from a finer level, whose splats are merged even where too few share a pixel: otherwise chair
-# would keep half of them at x0.57. The result has to have LEAST_DB: from 29 dB steps regained all that merging had cost, from 20 dB a third.
-COARSE_POWERS, LEAST_DB = (1, 7 / 8, 3 / 4, 5 / 8, 1 / 2), 25.0
+# The least dB of splats that are merged even where too few share a pixel: from 29 dB steps regained all that merging had cost, from 20 dB a third.
+LEAST_DB = 25.0
 
 # dB by which such a result may be worse than the base itself: steps regain 3 to 8 dB.
 COARSE_COSTS = 3.0
@@ -56,18 +53,6 @@ FAR_FEWER, REACHED = 1 / 4, 1.5
 
 # The budget is long enough for a search if that is expected to end within this part of the start's time; whole runs need less of it.
 SEARCH_PART = 1 / 4
-
-
-class Bounds(NamedTuple):
-    """The least dB of a candidate."""
-
-    psnr: float
-    visible: float
-    formed: float  # of the closed form, before merging
-
-    def hold_for(self, quality: Quality, more: float = 0.0) -> bool:
-        """Whether a candidate of this quality is good enough; its `psnr` may be lower by `more` dB."""
-        return quality.psnr >= self.psnr - more and quality.visible >= self.visible
 
 
 def start_name(forms: bool, *, merged: bool = False, thinned: bool = False) -> str:
@@ -143,7 +128,7 @@ class StartSearch:
         bounds = Bounds(self._least_psnr(after), before.visible - problem.may_lose, after.psnr)
         self._least = least_fraction(base, problem.views, problem.scale) if base.traits.thins else 0.0
         fewer = config.merge_to < 1 and self._least < 1
-        merged = self._merged(weights, bounds, self._coarse_bounds(bounds, before)) if fewer else None
+        merged = self._merger(weights).strongest(bounds, self._coarse_bounds(bounds, before)) if fewer else None
         if merged is not None:
             return merged, start_name(self._forms, merged=True, thinned=base.traits.thins)
         return (formed, start_name(True)) if self._forms and after.visible >= before.visible else (base, problem.name)
@@ -188,36 +173,18 @@ class StartSearch:
             return least
         return max(least, (formed.psnr + problem.quality(problem.coarse_base()).psnr) / 2)
 
-    def _merged(self, weights: Tensor | None, bounds: Bounds, coarse_bounds: Bounds | None) -> SplatModel | None:
-        """The candidate of the strongest merging within the bounds; None if merging costs too much.
+    def _merger(self, weights: Tensor | None) -> Merger:
+        config, count = self._problem.config, len(self._problem.base().parameters()["means"])
 
-        If the mildest merging already loses too much, as with captures, no stronger one is tried. If the mildest gains, a stronger one is tried
-        even where the base as it is looks better, since it may be better than both.
-        """
-        for power in COARSE_POWERS if coarse_bounds else ():
-            if not self._clock.allows("candidate", self._fraction(power)):
-                break
-            coarse, quality = self._tried(weights, power, coarsely=True)
-            if coarse_bounds and coarse_bounds.hold_for(quality):
-                return coarse
-        if not self._clock.allows("candidate", self._fraction(POWERS[-1])):
-            return None
-        mildest, quality = self._tried(weights, POWERS[-1])
-        suits = bounds.hold_for(quality, self._more_costs)
-        for power in POWERS[:-1] if suits or quality.psnr >= bounds.formed else ():
-            if not self._clock.allows("candidate", self._fraction(power)):
-                break
-            merged, quality = self._tried(weights, power)
-            if bounds.hold_for(quality):
-                return merged
-        return mildest if suits else None
+        def merge(power: float, coarsely: bool) -> tuple[SplatModel, Quality] | None:
+            fraction = self._fraction(power)
+            if not self._clock.allows("candidate", fraction):
+                return None
+            with self._clock.timing("candidate", fraction):
+                candidate = self._candidate(weights, fraction, coarsely)
+                return candidate, self._problem.quality(candidate)
 
-    def _tried(self, weights: Tensor | None, power: float, coarsely: bool = False) -> tuple[SplatModel, Quality]:
-        """A candidate and its quality."""
-        fraction = self._fraction(power)
-        with self._clock.timing("candidate", fraction):
-            candidate = self._candidate(weights, fraction, coarsely)
-            return candidate, self._problem.quality(candidate)
+        return Merger(merge, lambda power: math.ceil(self._fraction(power) * count), config.merging_costs, self._more_costs, config.steps > 0)
 
     def _fraction(self, power: float) -> float:
         """The fraction of the splats that a power of `merge_to` leaves."""

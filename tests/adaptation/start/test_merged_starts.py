@@ -65,7 +65,8 @@ def test_merged_splats_that_are_worse_than_the_base_are_not_begun_with(worth):
 
 def test_what_is_merged_furthest_without_being_worse_than_the_base_is_begun_with(worth):
     """Also where the closed form of all splats is worse than both."""
-    tried = worth(lambda place, _: [30.0, 20.0, 35.0, 25.0, 32.0][place])  # base, closed form, merging mildly, strongly, in between
+    dbs = dict(enumerate([30.0, 20.0, 35.0, 25.0, 32.0]))  # base, closed form, merging mildly, strongly, in between
+    tried = worth(lambda place, _: dbs.get(place, 0.0))  # and beyond the limits
     report = adapted(merge_to=0.5, merging_costs=COUNT).report
     assert (start_of(report), report.gaussians_after) == ("the closed form of merged splats", tried[4])
 
