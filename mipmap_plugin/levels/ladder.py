@@ -67,8 +67,9 @@ def _make_levels_by_zoom(base: FrozenBase, request: LadderRequest, resume: Path 
     work = _Work(base, request, store, yardstick)
     made, unused, lowest = work.levels(band)
     with announced("measuring the levels"):
-        levels, switches, unshown = _shown(made, yardstick)
-        edges = [1.0, *(switch.zoom for switch in switches), max(request.coarsest, lowest)]
+        end = max(request.coarsest, lowest)
+        levels, switches, unshown = _shown(made, yardstick, end)
+        edges = [1.0, *(switch.zoom for switch in switches), end]
         curve = _curve(levels, edges, yardstick, lambda zoom: yardstick.psnr_of_base(base, request.viewer, zoom))
     left_out = sorted([*unused, *unshown], key=lambda level: -level.scale)
     return Ladder(Contents(request, base, levels, switches, curve, left_out), store, write_ladder)
@@ -141,11 +142,14 @@ def _no_use(level: Level, finer: Level, yardstick: Yardstick) -> str | None:
     return NOT_BETTER if level.adapted.report.holds_base() else NO_FEWER
 
 
-def _shown(levels: list[Level], yardstick: Yardstick) -> tuple[list[Level], list[Switch], list[LeftOut]]:
-    """The levels that are shown at some zoom, the switches between them, and what is left out because its two switches are one."""
+def _shown(levels: list[Level], yardstick: Yardstick, end: float) -> tuple[list[Level], list[Switch], list[LeftOut]]:
+    """The levels that are shown at some zoom, the switches between them, and what is left out because its two switches are one.
+
+    `end`: the zoom at which the ladder ends.
+    """
     left_out = list[LeftOut]()
     while True:
-        switches = _switches(levels, yardstick)
+        switches = _switches(levels, yardstick, end)
         number = next((number for number, (to, start) in enumerate(pairwise(switches), 1) if to.zoom <= start.zoom * SAME), None)
         if number is None:
             return levels, switches, left_out
@@ -154,18 +158,21 @@ def _shown(levels: list[Level], yardstick: Yardstick) -> tuple[list[Level], list
         levels = [level for level in levels if level is not unshown]
 
 
-def _switches(levels: Sequence[Level], yardstick: Yardstick) -> list[Switch]:
+def _switches(levels: Sequence[Level], yardstick: Yardstick, end: float) -> list[Switch]:
     """The best zooms to change between neighboring levels: between their scales, or above both where the coarser is better at the finer's own scale,
-    as merged splats may be where a viewer draws no small ones."""
+    as merged splats may be where a viewer draws no small ones, or down to the end of the coarser's band where the finer is better at its scale."""
     switches = []
     for above, (finer, coarser) in zip([levels[0], *levels], pairwise(levels), strict=False):
 
         def measure(zoom: float, pair: tuple[Level, Level] = (finer, coarser)) -> tuple[float, float]:
             return yardstick.psnr(pair[0].adapted, zoom), yardstick.psnr(pair[1].adapted, zoom)
 
-        beaten = _better(yardstick, coarser, finer, finer.band.scale) > EVEN
-        low, high = (finer, above) if beaten else (coarser, finer)
-        zoom = switching_zoom(low.band.scale, high.band.scale, measure)
+        low, high = coarser.band.scale, finer.band.scale
+        if _better(yardstick, coarser, finer, high) > EVEN:
+            low, high = high, above.band.scale
+        elif _better(yardstick, finer, coarser, low) > EVEN:
+            low = min(low, max(coarser.band.low, end))
+        zoom = switching_zoom(low, high, measure)
         switches.append(Switch(zoom, yardstick.psnr(finer.adapted, zoom), yardstick.likeness(finer.adapted, coarser.adapted, zoom)))
     return switches
 

@@ -76,10 +76,10 @@ def test_a_level_whose_steps_regain_too_little_of_what_merging_cost_is_made_agai
 
 def test_a_level_that_is_shown_at_no_zoom_is_left_out():
     """Level 1 is worse than both neighbors, so that each of its switches lies at its own scale."""
-    levels = [Level(SimpleNamespace(number=number, model=tiny.model(3 - number)), Band(0.5**number, 0, 1, 2)) for number in range(3)]
+    levels = [Level(SimpleNamespace(number=number, model=tiny.model(3 - number)), Band(0.5**number, 0.7 * 0.5**number, 1, 2)) for number in range(3)]
     dbs = [lambda zoom: 40 + 10 * math.log2(zoom), lambda _: 10, lambda zoom: 30 - 5 * math.log2(zoom / 0.25)]
     yardstick = SimpleNamespace(psnr=lambda level, zoom: dbs[level.number](zoom), likeness=lambda *_: 30)
-    shown, switches, left_out = _shown(levels, yardstick)
+    shown, switches, left_out = _shown(levels, yardstick, 0.1)
     assert shown == [levels[0], levels[2]] and len(switches) == 1 and 0.25 < switches[0].zoom < 1
     assert left_out == [LeftOut(0.5, 2, UNSHOWN)]
 
@@ -88,11 +88,23 @@ def test_a_level_is_not_shown_where_a_coarser_one_is_better(monkeypatch):
     """Level 2 is better than level 1 at that one's own scale, x1/2, and up to x0.7."""
     for step in ("FIRST_STEP", "SECOND_STEP"):
         monkeypatch.setattr(f"mipmap_plugin.levels.switching.{step}", 1.05)
-    levels = [Level(SimpleNamespace(number=number), Band(0.5**number, 0, 1, 2)) for number in range(3)]
+    levels = [Level(SimpleNamespace(number=number), Band(0.5**number, 0.7 * 0.5**number, 1, 2)) for number in range(3)]
     dbs = [lambda zoom: 40 + 40 * math.log2(zoom), lambda _: 30, lambda zoom: 30 - 10 * math.log2(zoom / 0.7)]
     yardstick = SimpleNamespace(psnr=lambda level, zoom: dbs[level.number](zoom), likeness=lambda *_: 30)
-    _, switches, left_out = _shown(levels, yardstick)
+    _, switches, left_out = _shown(levels, yardstick, 0.1)
     assert 0.8 < switches[0].zoom < 0.9 and 0.65 < switches[1].zoom < 0.75 and not left_out
+
+
+@pytest.mark.parametrize(("end", "zoom"), [(0.1, 0.4), (0.45, 0.45)])
+def test_a_level_is_shown_below_the_scale_of_the_coarser_one_where_it_is_better_until_the_ladder_ends(monkeypatch, end, zoom):
+    """Level 0 is better than level 1 at that one's own scale, x1/2, and down to x0.4."""
+    for step in ("FIRST_STEP", "SECOND_STEP"):
+        monkeypatch.setattr(f"mipmap_plugin.levels.switching.{step}", 1.02)
+    levels = [Level(SimpleNamespace(number=number), Band(0.5**number, 0.7 * 0.5**number, 1, 2)) for number in range(2)]
+    dbs = [lambda zoom: 30 + 10 * math.log2(zoom / 0.4), lambda _: 30]
+    yardstick = SimpleNamespace(psnr=lambda level, zoom: dbs[level.number](zoom), likeness=lambda *_: 30)
+    _, (switch,), _ = _shown(levels, yardstick, end)
+    assert switch.zoom == pytest.approx(zoom, rel=0.05)
 
 
 def test_a_ladder_ends_with_few_enough_splats():
