@@ -137,7 +137,9 @@ def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path
         lines.append(f"  {', '.join(missed)}: below the {manifest['least_db']:g} dB that were asked for, in the narrowest band that is tried")
     lines += _left_out(manifest)
     base = min(point["base_db"] for point in manifest["curve"])
-    lines.append(f"  at worst {manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} on average; the base alone falls to {base:.1f} dB")
+    steps = [abs(each["step_db"]) for each in manifest["switches"] if "step_db" in each]
+    changed = f", at most {max(steps):.1f} lost or gained at a switch" if steps else ""
+    lines.append(f"  at worst {manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} on average{changed}; the base alone falls to {base:.1f} dB")
     lines.append(f"  {manifest['measured']}")
     say("\n".join([*lines, *(look_at(path) if path.name == PAGE else f"  {path}" for path in exports)]))
 

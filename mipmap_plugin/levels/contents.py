@@ -36,7 +36,8 @@ class Switch:
     """The zoom at which a viewer should change between two levels, and how little it shows."""
 
     zoom: float
-    psnr_db: float  # of the finer level there, against the base; about that of the coarser
+    psnr_db: float  # of the finer level there, against the base
+    step_db: float  # dB of the finer level there minus those of the coarser
     likeness_db: float  # PSNR between the images of both levels there
 
 

@@ -173,7 +173,8 @@ def _switches(levels: Sequence[Level], yardstick: Yardstick, end: float) -> list
         elif _better(yardstick, finer, coarser, low) > EVEN:
             low = min(low, max(coarser.band.low, end))
         zoom = switching_zoom(low, high, measure)
-        switches.append(Switch(zoom, yardstick.psnr(finer.adapted, zoom), yardstick.likeness(finer.adapted, coarser.adapted, zoom)))
+        before, after = measure(zoom)
+        switches.append(Switch(zoom, before, before - after, yardstick.likeness(finer.adapted, coarser.adapted, zoom)))
     return switches
 
 

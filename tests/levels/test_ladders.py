@@ -124,6 +124,8 @@ def test_a_saved_ladder_says_what_it_is(tmp_path):
     assert levels[0]["shown_to"] is None and levels[-1]["shown_from"] is None
     switches = [each["zoom"] for each in manifest["switches"]]
     assert [level["shown_from"] for level in levels[:-1]] == [level["shown_to"] for level in levels[1:]] == switches
+    shown = [[point["psnr_db"] for point in manifest["curve"] if point["level"] == number] for number in range(2)]
+    assert manifest["switches"][0]["step_db"] == pytest.approx(shown[0][-1] - shown[1][0])
     assert manifest["worst_db"] == min(point["psnr_db"] for point in manifest["curve"]) and manifest["viewer"] == "antialiased"
     assert [point["zoom"] for point in manifest["curve"]] == sorted((point["zoom"] for point in manifest["curve"]), reverse=True)
     with pytest.raises(OutputExists, match="exists already"):
@@ -211,5 +213,6 @@ def test_the_command_makes_a_ladder_and_prints_it(tmp_path, capsys):
     print_summary(tmp_path, manifest | {"levels": [manifest["levels"][0] | {"psnr_db": {"1": 27.53, "0.5": 27.46}}]})
     assert ": 27.5 dB, " in capsys.readouterr().out
     assert "2 levels" in said and "level_1.ply  x0.5, shown up to" in said and "at worst" in said
+    assert f", at most {abs(manifest['switches'][0]['step_db']):.1f} lost or gained at a switch; the base" in said
     assert not state_path(tmp_path / "ladder").exists() and not (tmp_path / "ladder" / "report.html").exists()
     assert cli.main(words) == 2 and "--overwrite" in capsys.readouterr().err
