@@ -185,7 +185,7 @@ class StartSearch:
                 candidate = self._candidate(weights, fraction, coarsely)
                 return candidate, self._problem.quality(candidate)
 
-        return Merger(merge, lambda power: self._fraction(power) * count, config.merging_costs, self._more_costs, config.steps > 0)
+        return Merger(merge, lambda power: math.ceil(self._fraction(power) * count), config.merging_costs, self._more_costs, config.steps > 0)
 
     def _fraction(self, power: float) -> float:
         """The fraction of the splats that a power of `merge_to` leaves."""

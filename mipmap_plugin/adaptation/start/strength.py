@@ -16,7 +16,7 @@ POWERS = (1, 1 / 2, 1 / 4)
 COARSE_POWERS = (1, 7 / 8, 3 / 4, 5 / 8, 1 / 2)
 
 # The powers that are tried after those where no step follows and merging gains, as of dots too small for the viewer to draw: even where too few share
-# a pixel. At x0.57 in PlayCanvas a lattice of dots gains 1 dB by the first.
+# a pixel. At x0.57 in PlayCanvas a lattice of dots gains 0.6 dB by the first.
 FURTHER_POWERS = (1 / 2, 3 / 4, 1)
 
 Candidate = tuple[SplatModel, Quality]
@@ -42,7 +42,7 @@ class Merger(NamedTuple):
     """What merges splats as strongly as it is told, and what that may cost."""
 
     merge: Callable[[float, bool], Candidate | None]  # to a power of `merge_to`, whether even where too few share a pixel; None: there is no time
-    least: Callable[[float], float]  # how many splats a power leaves where as many are merged as it says
+    least: Callable[[float], int]  # how many splats a power leaves where as many are merged as it says
     costs: float  # dB that merging may cost
     more_costs: float  # dB that the mildest merging may cost beyond that
     learns: bool  # whether steps follow, which regain what merging costs

@@ -23,7 +23,7 @@ def chosen(limited, coarse, *, learns=False, reached=0):
         left, psnrs = (left, coarse) if coarsely else (max(left, reached), limited)
         return tiny.model(left), Quality(*[psnrs.get(left, -math.inf)] * 2)
 
-    found = Merger(merge, lambda power: SPLATS * 16**-power, 0.3, 0.0, learns).strongest(BOUNDS, None)
+    found = Merger(merge, lambda power: math.ceil(SPLATS * 16**-power), 0.3, 0.0, learns).strongest(BOUNDS, None)
     return None if found is None else len(found)
 
 
