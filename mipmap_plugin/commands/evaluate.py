@@ -73,7 +73,7 @@ def evaluate(
         overwrite: Replace files that exist.
         json: Print JSON instead of a table.
     """
-    page = evaluation_page_path(checkpoint[0], output) if report else None
+    page = evaluation_page_path(checkpoint[0], output) if report and checkpoint else None
     _refuse(checkpoint, images, cameras, [path for path in (output, page) if path], overwrite)
     settings = without_none(seed=seed, steps=steps, upsampler=upsampler, resize=resize, viewer=viewer)
     results = _Results(protocol, _perceptual(lpips, lpips_weights), unique_scales(scale), page, output)
@@ -179,6 +179,8 @@ def _scene(base: Base, folder: Path, appearance: str) -> Scene:
 
 
 def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], cameras: Sequence[Path], outputs: Sequence[Path], overwrite: bool) -> None:
+    if not checkpoint:
+        raise SettingsError("there is no checkpoint to evaluate; give a PLY or a model folder, or several of them, and --images for each")
     for option, given in {"--images": images, "--cameras": cameras or checkpoint}.items():
         if len(checkpoint) != len(given):
             how = f"one for each checkpoint, all behind one {option}"

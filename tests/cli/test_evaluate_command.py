@@ -171,6 +171,10 @@ def test_a_lone_file_is_judged_by_photographs_with_the_cameras_that_are_given(ru
     refused(run("evaluate", lone, *words, "--cameras", scene, scene), "--cameras: give one for each checkpoint", "; got 2, for 1 of these")
 
 
+def test_evaluate_asks_for_a_checkpoint(run, tmp_path):
+    refused(run("evaluate", "--images", tmp_path, "--scale", "1/2"), "there is no checkpoint to evaluate; give a PLY or a model folder")
+
+
 def test_evaluate_refuses_what_cannot_be_judged(run, model_folder, tmp_path):
     scene = tiny.scene(tmp_path / "scene")
     refused(run("evaluate", tiny.ply(tmp_path / "a.ply"), "--images", scene, "--scale", "1"), "has no cameras, so its base scale is not known")
