@@ -1,7 +1,5 @@
 """The families with a `filter_3D` column: against the published formulas, there and back, and adapted."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
