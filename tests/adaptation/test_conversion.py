@@ -32,6 +32,17 @@ def wrapped(screen_filter="classic"):
     return wrap_model(tiny.model(60, TrainedScale(screen_filter)), cameras=tiny.cameras(8), backend="cpu", threads=1)
 
 
+def pressing_at(steps, nth):
+    """An observer that notes the steps, and presses Ctrl-C in the nth."""
+
+    def press(step, seconds, render):
+        steps.append(step)
+        if len(steps) == nth:
+            signal.raise_signal(signal.SIGINT)
+
+    return press
+
+
 def settings_of(scale=2.0, targets=(OTHER,), **settings):
     return conversion(recipe("default", scale, **settings), BASE, targets, scale)
 
@@ -129,12 +140,7 @@ def test_it_brings_a_zoom_in_closer_to_the_base():
 def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path, nth):
     whole = wrapped().adapt(2, viewer="antialiased", **BRIEF)
     state, steps = tmp_path / "run.resume", []
-
-    def press(step, seconds, render):
-        steps.append(step)
-        if len(steps) == nth:
-            signal.raise_signal(signal.SIGINT)
-
+    press = pressing_at(steps, nth)
     with pytest.raises(Interrupted, match=f"continue from .*run.resume{'.x1' if nth == 2 else ''}$"):
         wrapped().adapt(2, viewer="antialiased", resume=state, observe=press, **BRIEF)
     assert steps == [0, 1, 2, 3, 4, 5][:nth]
@@ -148,13 +154,8 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path, nth):
 def test_what_the_conversion_kept_stays_where_the_zoom_in_is_refused(tmp_path):
     """As by a state of another version."""
     state = tmp_path / "run.resume"
-
-    def press(step, seconds, render):
-        if step == 5:
-            signal.raise_signal(signal.SIGINT)
-
     with pytest.raises(Interrupted):
-        wrapped().adapt(2, viewer="antialiased", resume=state, observe=press, **BRIEF)
+        wrapped().adapt(2, viewer="antialiased", resume=state, observe=pressing_at([], 6), **BRIEF)
     content = load_torch(state)
     save_torch(state, content | {"fingerprint": "", "versions": {"mipmap_plugin": "0.0.1"}}, overwrite=True)
     with pytest.raises(SettingsError, match=r"run.resume: this state was left by mipmap_plugin 0\.0\.1, and this is .*; go on with that"):
@@ -207,12 +208,7 @@ def test_with_a_budget_too_what_has_ended_is_not_taken_further(tmp_path, monkeyp
     budget = {**BRIEF, "steps": 20, "time_budget_s": 60.0}
     monkeypatch.setattr("mipmap_plugin.adaptation.optimization.budget.Pace.steps", lambda *_: 3)
     state, steps = tmp_path / "run.resume", []
-
-    def press(step, seconds, render):
-        steps.append(step)
-        if len(steps) == 6:
-            signal.raise_signal(signal.SIGINT)
-
+    press = pressing_at(steps, 6)
     with pytest.raises(Interrupted):
         wrapped().adapt(2, viewer="antialiased", resume=state, observe=press, **budget)
     wrapped().adapt(2, viewer="antialiased", resume=state, observe=press, **budget)

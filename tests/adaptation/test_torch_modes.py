@@ -1,7 +1,5 @@
 """Modes of torch that a caller has set change nothing."""
 
-from __future__ import annotations
-
 import runpy
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager

@@ -1,7 +1,5 @@
 """Every backend on every hard case, and the suite itself on backends that are wrong on purpose."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """The backward pass is compiled in another process where that pays."""
 
-from __future__ import annotations
-
 import io
 import pickle
 

@@ -1,7 +1,5 @@
 """The CPU backend against a brute-force float64 sum, and errors that only compiled, threaded code can have."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 import os

@@ -1,7 +1,5 @@
 """What numba is kept from doing to kernels, because it takes seconds at the first run and gains nothing."""
 
-from __future__ import annotations
-
 import operator
 import os
 import re

@@ -1,7 +1,5 @@
 """The parts of the CPU backend by themselves: powers in lanes, how threads share work, and sorting."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

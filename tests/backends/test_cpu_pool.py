@@ -1,7 +1,5 @@
 """Memory that is used again."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

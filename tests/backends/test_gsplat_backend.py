@@ -1,7 +1,5 @@
 """The arguments that gsplat is called with, and what its torch implementations render with them on the CPU."""
 
-from __future__ import annotations
-
 import importlib.util
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """The arguments that INRIA's rasterizer is called with, in both generations, and that they describe the reference's image."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 import sys

@@ -3,8 +3,6 @@
 Without a GPU they are skipped, or with TRY_WITHOUT_GPU=1 done by another backend of the processor.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from functools import cache

@@ -1,7 +1,5 @@
 """Models, adapting and saving on another device than the processor, which is pretended: nothing mixes the two, and results are the same."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

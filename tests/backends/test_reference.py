@@ -1,7 +1,5 @@
 """The reference against a brute-force sum, published test vectors, finite differences and gsplat's CPU twins."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

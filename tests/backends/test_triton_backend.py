@@ -1,7 +1,5 @@
 """The Triton backend without a GPU: its kernels compile, and it reports what is missing. Their results: `test_triton_interpreted*.py`."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import subprocess

@@ -1,7 +1,5 @@
 """The Triton kernels in Triton's interpreter: tiny images on the CPU. Run with `TRITON_INTERPRET=1 pytest -m interpreter`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

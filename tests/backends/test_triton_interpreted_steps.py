@@ -1,7 +1,5 @@
 """The Triton kernels in Triton's interpreter: several views in one call, and steps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Windows: occlusion by an edge, and sizes at which the integrals would cancel or overflow."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 

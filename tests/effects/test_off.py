@@ -156,6 +156,12 @@ def test_fields_that_multiply_count_as_moving(tmp_path, options, moves):
     assert model.model.moves == moves
 
 
+def test_a_field_that_shifts_all_splats_alike_counts_as_moving(tmp_path):
+    state = zero_heads(moving.hexplane_state())
+    state["deformation_net.pos_deform.3.bias"] = torch.tensor([0.1, 0.0, 0.0])
+    assert wrap_model(moving.write_hexplane(tmp_path / "new", "", state), cameras=tiny.cameras(1)).model.moves
+
+
 def test_a_static_scene_evaluates_no_field(monkeypatch):
     evaluated = counted(monkeypatch, DeformNetwork, "changes"), counted(monkeypatch, HexPlane, "changes")
     assert "time" not in wrapped(with_bands(1, 1)).adapt(1 / 4, **BRIEF).report.views

@@ -1,7 +1,5 @@
 """Adaptation of every family in the situations in which optimizers and rasterizers break: it ends, finite, and the base stays as it was."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib.util
 from itertools import product

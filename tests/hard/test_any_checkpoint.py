@@ -1,7 +1,5 @@
 """Whatever numbers a checkpoint holds: a finite image with finite gradients, or one sentence. hypothesis looks for the numbers."""
 
-from __future__ import annotations
-
 import importlib.util
 from dataclasses import replace
 

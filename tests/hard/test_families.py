@@ -1,7 +1,5 @@
 """Every family of checkpoints with hard rows among ordinary ones: splats, image and gradients are finite, or the file is refused."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Splats in float32 whose place or shape on the image is a small difference of large numbers: every digit that their numbers hold is used."""
 
-from __future__ import annotations
-
 import importlib.util
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Which appearance test views take of models that have one for each training view."""
 
-from __future__ import annotations
-
 import json
 
 import anchor_checkpoints as checkpoints

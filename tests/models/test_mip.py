@@ -1,7 +1,5 @@
 """The families with a `filter_3D` column: against the published formulas, there and back, and adapted."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
@@ -42,6 +40,11 @@ def by_the_formulas(columns: dict[str, np.ndarray], smooth: bool = True) -> Gaus
     bands = [pick(*(f"f_rest_{c * 3 + j}" for c in range(3))) for j in range(3)]
     sh = torch.stack([pick("f_dc_0", "f_dc_1", "f_dc_2"), *bands], 1)
     return Gaussians(pick("x", "y", "z"), pick("rot_0", "rot_1", "rot_2", "rot_3"), larger.sqrt(), opacities, sh)
+
+
+def fused() -> dict[str, np.ndarray]:
+    """The columns of 3DGS that Mip-Splatting fuses its filter into."""
+    return {name: column for name, column in splats().items() if name != "filter_3D"}
 
 
 def ball(family: str = "mip", count: int = 60) -> MipModel:
@@ -191,10 +194,9 @@ def test_filters_that_no_camera_sees_are_refused():
 
 def test_a_fused_file_is_recognized_by_its_options_or_given_its_filter(tmp_path):
     """It has the columns of 3DGS: the options beside it or the user name its filter. Adapted, it is drawn as its training drew it."""
-    plain = {name: column for name, column in splats().items() if name != "filter_3D"}
-    inside = wrap_model(folder(tmp_path / "model", columns=plain), cameras=tiny.cameras())
+    inside = wrap_model(folder(tmp_path / "model", columns=fused()), cameras=tiny.cameras())
     assert inside.model.family == "3dgs" and (inside.effects().screen_filter, inside.effects().eps2d) == ("mip", 0.1)
-    bare = load_model(ply_files.write(tmp_path / "fused.ply", plain))
+    bare = load_model(ply_files.write(tmp_path / "fused.ply", fused()))
     assert bare.trained.screen_filter == "classic" and any("fused" in note for note in bare.notes)
     wrapped = wrap_model(bare, cameras=tiny.cameras(), screen_filter="mip")
     assert (wrapped.effects().screen_filter, wrapped.effects().eps2d) == ("mip", 0.1)
@@ -209,8 +211,7 @@ def test_a_fused_file_is_recognized_by_its_options_or_given_its_filter(tmp_path)
 
 
 def test_an_adapted_file_in_a_folder_of_mip_splatting_stays_classic(tmp_path):
-    plain = {name: column for name, column in splats().items() if name != "filter_3D"}
-    adapted = wrap_model(folder(tmp_path / "model", columns=plain), cameras=tiny.cameras()).adapt(0.25, viewer="classic", steps=0)
+    adapted = wrap_model(folder(tmp_path / "model", columns=fused()), cameras=tiny.cameras()).adapt(0.25, viewer="classic", steps=0)
     adapted.save(tmp_path / "adapted")
     assert load_model(tmp_path / "adapted").trained.screen_filter == "classic"
 
@@ -219,18 +220,17 @@ def test_real_files(shared_data):
     filtered = load_model(shared_data / "checkpoints" / "filter3d_2000")
     column = read_ply(shared_data / "checkpoints" / "filter3d_2000" / "point_cloud.ply").columns["filter_3D"]
     assert filtered.family == "mip" and (filtered.gaussians().scales.amin(1) >= torch.from_numpy(column.copy())[: len(filtered)] * 0.999).all()
-    fused = load_model(shared_data / "checkpoints" / "donut_mip_fused" / "fused.ply")
-    assert fused.family == "3dgs" and any("fused" in note for note in fused.notes)
-    view = replace(tiny.cameras(1)[0])
-    assert torch.isfinite(wrap_model(fused, cameras=[view], screen_filter="mip").render(view).image).all()
+    model = load_model(shared_data / "checkpoints" / "donut_mip_fused" / "fused.ply")
+    assert model.family == "3dgs" and any("fused" in note for note in model.notes)
+    view = tiny.cameras(1)[0]
+    assert torch.isfinite(wrap_model(model, cameras=[view], screen_filter="mip").render(view).image).all()
 
 
 def test_the_command_line_takes_the_filter(tmp_path, capsys):
-    plain = {name: column for name, column in splats().items() if name != "filter_3D"}
-    fused = ply_files.write(tmp_path / "fused.ply", plain)
-    assert main(["inspect", str(fused), "--screen-filter", "mip"]) == 0
+    file = ply_files.write(tmp_path / "fused.ply", fused())
+    assert main(["inspect", str(file), "--screen-filter", "mip"]) == 0
     assert "mip, 0.1 px²" in capsys.readouterr().out
-    assert main(["adapt", str(fused), "--scale", "4", "--screen-filter", "mip", "--steps", "0", "--json"]) == 0
+    assert main(["adapt", str(file), "--scale", "4", "--screen-filter", "mip", "--steps", "0", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)[0]["filters"].endswith("base mip 0.1 px²; file mip 0.1 px²")
 
 

@@ -1,7 +1,5 @@
 """Files of related projects, and side files: read as what they are, or refused by name."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 

@@ -1,7 +1,5 @@
 """2D Gaussian Splatting: flat splats met by rays, against the paper's homographies in float64; read, adapted and saved."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

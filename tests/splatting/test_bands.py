@@ -1,7 +1,5 @@
 """Constant and other bands of a color as one tensor."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

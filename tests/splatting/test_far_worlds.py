@@ -1,7 +1,5 @@
 """Scenes far from the origin, such as georeferenced captures: images are the same as at the origin."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

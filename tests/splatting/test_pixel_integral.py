@@ -1,7 +1,5 @@
 """The integral over a pixel where its published formula breaks: round, axis-aligned, flat, much wider and much thinner than a pixel."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 

@@ -1,7 +1,5 @@
 """Checkpoints of Scaffold-GS and Octree-GS in the originals' formats, from seeded numbers, written without the package's writers."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from pathlib import Path

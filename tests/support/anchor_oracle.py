@@ -1,7 +1,5 @@
 """The decoding of anchors in float64, one anchor after the other, written from the formats' formulas and not from the package's code."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One small sound checkpoint or scene for each kind of file that is read, and which of its files is damaged."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import struct

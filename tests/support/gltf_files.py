@@ -1,7 +1,5 @@
 """A small writer of splats in glTF (KHR_gaussian_splatting), for tests."""
 
-from __future__ import annotations
-
 import copy
 import json
 import struct

@@ -1,7 +1,5 @@
 """`gsplat.rasterization` on a processor: gsplat's own torch twins, and a plain compositor in place of the part that needs CUDA."""
 
-from __future__ import annotations
-
 import inspect
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """A stand-in for `diff_gaussian_rasterization` on the CPU: its names, and images that the reference renders from its arguments."""
 
-from __future__ import annotations
-
 from collections import namedtuple
 from types import SimpleNamespace
 

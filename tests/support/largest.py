@@ -1,7 +1,5 @@
 """The largest tensor that a computation makes: one with a number for each pair of thousands of views takes seconds and gigabytes."""
 
-from __future__ import annotations
-
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 

@@ -1,7 +1,5 @@
 """Checkpoints of Mip-Splatting, GOF and Analytic-Splatting as their projects leave them, from seeded numbers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Moving scenes for the tests: model folders as the two projects write them, from seeded weights, and what adapting them gains."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean

@@ -1,7 +1,5 @@
 """An independent float64 renderer: one sum per pixel over all splats, written from the formulas and not from the package's code."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Small PLY files, sound and broken, made by hand so that no writer's habits hide a reader's."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -5,8 +5,6 @@ as on a GPU, as does one that torch implements for the CPU only. One whose resul
 line that calls it.
 """
 
-from __future__ import annotations
-
 import traceback
 import types
 from collections import Counter

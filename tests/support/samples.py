@@ -1,7 +1,5 @@
 """Small random scenes for the tests, all from a seed."""
 
-from __future__ import annotations
-
 import torch
 
 from mipmap_plugin.camera import Camera

@@ -1,7 +1,5 @@
 """A scene that adapts in a moment: a ball of splats, the cameras around it, and the checkpoint that holds both."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

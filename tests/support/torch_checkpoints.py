@@ -1,7 +1,5 @@
 """Checkpoints of gsplat and splatfacto, written from seeded weights exactly as the two projects write them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the tests of the Triton kernels in Triton's interpreter share: how a scene is drawn, and what it is compared with."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 from collections.abc import Iterator

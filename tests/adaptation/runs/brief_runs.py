@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
+import pytest
 import tiny
 
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
-from mipmap_plugin.wrap import wrap_model
+from mipmap_plugin.wrap import Interrupted, wrap_model
 
 WHITE = (1.0, 1.0, 1.0)
 
@@ -17,6 +18,15 @@ BRIEF_PAPER = dict(steps=7, check_every=2, prune_every=3, densify_gradient=1e-9)
 
 def wrapped(count=40, cameras=None, backend="auto", **trained):
     return wrap_model(tiny.model(count, TrainedScale(**trained)), cameras=tiny.cameras() if cameras is None else cameras, backend=backend)
+
+
+def resumed(adapt, state, ctrl_c, *steps):
+    """What `adapt(resume=state)` returns that was interrupted before, in each of `steps` once."""
+    for nth in steps:
+        ctrl_c(nth)
+        with pytest.raises(Interrupted, match=f"interrupted at step .*; run the same command again to continue from .*{state.name}"):
+            adapt(resume=state)
+    return adapt(resume=state)
 
 
 def is_finite(model) -> bool:

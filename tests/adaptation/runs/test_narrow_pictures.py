@@ -1,7 +1,5 @@
 """Pictures of a pixel or two, of which a bicubic filter would show the middle alone: what comes back looks like all of the base's picture."""
 
-from __future__ import annotations
-
 from statistics import fmean
 
 import pytest

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
-from brief_runs import BRIEF, BRIEF_PAPER, WHITE, shown, wrapped
+from brief_runs import BRIEF, BRIEF_PAPER, WHITE, resumed, shown, wrapped
 
 from mipmap_plugin.adaptation.optimization.budget import Pace
 from mipmap_plugin.adaptation.optimization.costs import Costs
@@ -17,6 +17,11 @@ from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
 
+def anew(base, settings):
+    """A run by a base that `base` makes each time, as another process would."""
+    return lambda **resume: base().adapt(1 / 4, **settings, **resume)
+
+
 def with_extras(path):
     """A checkpoint with a column that 3DGS does not know."""
     model = tiny.model(40)
@@ -25,54 +30,38 @@ def with_extras(path):
 
 @pytest.mark.parametrize("nth", [1, 2, 5, 7])  # the first step; before and after a pruning; the last step
 def test_a_resumed_default_run_equals_an_uninterrupted_one(tmp_path, ctrl_c, nth):
-    whole = wrapped().adapt(1 / 4, **BRIEF)
-    ctrl_c(nth)
-    state = tmp_path / "run.resume"
-    with pytest.raises(Interrupted, match=rf"interrupted at step {nth}; run the same command again to continue from .*run.resume"):
-        wrapped().adapt(1 / 4, resume=state, **BRIEF)
-    resumed = wrapped().adapt(1 / 4, resume=state, **BRIEF)
+    adapt, state = anew(wrapped, BRIEF), tmp_path / "run.resume"
+    whole, again = adapt(), resumed(adapt, state, ctrl_c, nth)
     assert state.exists()  # should the disk be full, nothing is lost
-    files = [adapted.save(tmp_path / f"{i}.ply").read_bytes() for i, adapted in enumerate((whole, resumed))]
+    files = [adapted.save(tmp_path / f"{i}.ply").read_bytes() for i, adapted in enumerate((whole, again))]
     assert files[0] == files[1] and not state.exists()
-    assert [(p.step, p.psnr_db, p.gaussians) for p in resumed.report.curve] == [(p.step, p.psnr_db, p.gaussians) for p in whole.report.curve]
+    assert [(p.step, p.psnr_db, p.gaussians) for p in again.report.curve] == [(p.step, p.psnr_db, p.gaussians) for p in whole.report.curve]
 
 
 def test_a_resumed_run_moves_no_coefficients_that_a_whole_one_leaves_alone(tmp_path, ctrl_c):
     """View-dependent color that no viewer evaluates has no gradient, also after splats were dropped."""
     base = wrap_model(VanillaModel.from_gaussians(tiny.with_bands(0, 1)), cameras=tiny.cameras(), backend="cpu")
-    whole = base.adapt(1 / 4, **BRIEF, returns="last")
-    ctrl_c(5)
-    with pytest.raises(Interrupted):
-        base.adapt(1 / 4, resume=tmp_path / "state", **BRIEF, returns="last")
-    resumed = base.adapt(1 / 4, resume=tmp_path / "state", **BRIEF, returns="last")
+    adapt = anew(lambda: base, BRIEF | {"returns": "last"})
+    whole, again = adapt(), resumed(adapt, tmp_path / "state", ctrl_c, 5)
     assert len(whole.model) < len(base.model)
-    assert all(torch.equal(tensor, resumed.model.parameters()[name]) for name, tensor in whole.model.parameters().items())
+    assert all(torch.equal(tensor, again.model.parameters()[name]) for name, tensor in whole.model.parameters().items())
 
 
 @pytest.mark.parametrize("nth", [2, 5])  # before and after splats were cloned
 @pytest.mark.parametrize("views", [1, 2])  # two share an activation
 def test_a_resumed_paper_run_equals_an_uninterrupted_one(tmp_path, ctrl_c, nth, views):
-    settings = {**BRIEF_PAPER, "views_per_step": views}
-    whole = wrapped(background=WHITE).adapt(1 / 4, recipe="paper", **settings).model
-    ctrl_c(nth)
-    with pytest.raises(Interrupted):
-        wrapped(background=WHITE).adapt(1 / 4, recipe="paper", resume=tmp_path / "state", **settings)
-    resumed = wrapped(background=WHITE).adapt(1 / 4, recipe="paper", resume=tmp_path / "state", **settings).model
-    files = [model.save(tmp_path / f"{i}.ply", provenance={}).read_bytes() for i, model in enumerate((whole, resumed))]
+    adapt = anew(lambda: wrapped(background=WHITE), BRIEF_PAPER | {"recipe": "paper", "views_per_step": views})
+    both = adapt(), resumed(adapt, tmp_path / "state", ctrl_c, nth)
+    files = [adapted.model.save(tmp_path / f"{i}.ply", provenance={}).read_bytes() for i, adapted in enumerate(both)]
     assert files[0] == files[1]
 
 
 @pytest.mark.parametrize(("merging", "times"), [({}, 2), ({"merge_to": 0.5, "merging_costs": 9.0}, 1)])
 def test_a_run_that_is_interrupted_once_or_twice_equals_an_uninterrupted_one(tmp_path, ctrl_c, merging, times):
-    settings = BRIEF | merging
-    whole = wrapped().adapt(1 / 4, **settings)
-    for _ in range(times):
-        ctrl_c(2)
-        with pytest.raises(Interrupted):
-            wrapped().adapt(1 / 4, resume=tmp_path / "state", **settings)
-    resumed = wrapped().adapt(1 / 4, resume=tmp_path / "state", **settings)
-    assert torch.equal(shown(resumed), shown(whole))
-    assert not merging or resumed.report.gaussians_after < resumed.report.gaussians_before
+    adapt = anew(wrapped, BRIEF | merging)
+    whole, again = adapt(), resumed(adapt, tmp_path / "state", ctrl_c, *[2] * times)
+    assert torch.equal(shown(again), shown(whole))
+    assert not merging or again.report.gaussians_after < again.report.gaussians_before
 
 
 def test_a_resumed_run_tells_the_seconds_of_both_processes(tmp_path, ctrl_c, monkeypatch):
@@ -110,11 +99,8 @@ def test_a_resumed_run_goes_on_as_planned(tmp_path, ctrl_c, monkeypatch):
 def test_extra_columns_outlive_a_resumption_unless_splats_were_dropped(tmp_path, ctrl_c):
     path = with_extras(tmp_path / "base.ply")
     for name, settings, kept in [("all", {**BRIEF, "min_opacity": 0.0}, True), ("some", {**BRIEF, "returns": "last"}, False)]:
-        ctrl_c(5)
-        with pytest.raises(Interrupted):
-            wrap_model(path, cameras=tiny.cameras()).adapt(1 / 4, resume=tmp_path / "state", **settings)
-        resumed = wrap_model(path, cameras=tiny.cameras()).adapt(1 / 4, resume=tmp_path / "state", **settings)
-        assert ("confidence" in read_ply(resumed.save(tmp_path / f"{name}.ply")).columns) == kept
+        adapted = resumed(anew(lambda: wrap_model(path, cameras=tiny.cameras()), settings), tmp_path / "state", ctrl_c, 5)
+        assert ("confidence" in read_ply(adapted.save(tmp_path / f"{name}.ply")).columns) == kept
 
 
 def test_columns_that_new_splats_do_not_have_are_told_of_once_and_in_the_report(tmp_path):

@@ -1,7 +1,5 @@
 """Bases that were trained with compensation: what is made of them without a viewer, and what is told where their own renderer shows them better."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import mip_checkpoints

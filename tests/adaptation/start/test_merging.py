@@ -116,6 +116,12 @@ def test_unlike_colors_stay_apart():
     assert left.sh[:, 0].unique().numel() == 2
 
 
+def test_colors_that_a_display_shows_alike_are_alike():
+    bright = replace(cloud(2), means=torch.zeros(2, 3))
+    bright.sh[0], bright.sh[1] = 5.0, 9.0
+    assert len(merged(bright, 0.5)) == 1
+
+
 def test_unlike_shapes_stay_apart():
     needles = replace(cloud(2), means=torch.zeros(2, 3), scales=torch.tensor([[5.0, 0.1, 0.1], [0.1, 5.0, 0.1]]))
     needles = replace(needles, quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(2, 1))

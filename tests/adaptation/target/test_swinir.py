@@ -1,7 +1,5 @@
 """SwinIR (Liang et al. 2021), the network that Mipmap-GS zooms in with, in its published configurations and with seeded weights."""
 
-from __future__ import annotations
-
 import sys
 import warnings
 

@@ -1,7 +1,5 @@
 """A lone adapted file is looked at by the cameras of its base, where these are found."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

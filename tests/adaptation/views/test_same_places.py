@@ -1,7 +1,5 @@
 """Without cameras a base and what is adapted from it are looked at from the same places."""
 
-from __future__ import annotations
-
 import json
 from functools import partial
 

@@ -132,6 +132,17 @@ def test_only_a_scene_flat_along_y_tells_its_vertical(spread, up):
 # jittered
 
 
+def straight(x: float = 0.0, turn: float = 0.0) -> Camera:
+    """A camera at a place along x, which is turned about y by an angle."""
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3], viewmat[0, 3] = rotation_matrix(torch.tensor([0.0, turn, 0.0], dtype=torch.float64)), -x
+    return Camera(8, 8, 8.0, 8.0, 4.0, 4.0, viewmat)
+
+
+def on_a_line(*places: float) -> list[Camera]:
+    return [straight(x) for x in places]
+
+
 @pytest.mark.parametrize("vector", [(0.3, -0.8, 0.5), (0.0, 0.0, 0.0)])
 def test_rotation_vector_and_matrix_are_inverse(vector):
     vector = torch.tensor(vector, dtype=torch.float64)
@@ -162,10 +173,7 @@ def test_jittered_views_see_the_scene():
 
 
 def test_parallel_cameras_have_views_on_the_line_through_both_and_a_little_beyond():
-    left = Camera(8, 8, 8.0, 8.0, 4.0, 4.0, torch.eye(4))
-    right = replace(left, viewmat=torch.eye(4, dtype=torch.float64))
-    right.viewmat[0, 3] = -2.0
-    centers = torch.stack([view.center for view in jittered([left, right], 50, seeded(), amount=0.0)])
+    centers = torch.stack([view.center for view in jittered(on_a_line(0.0, 2.0), 50, seeded(), amount=0.0)])
     assert torch.equal(centers[:, 1:], torch.zeros(50, 2, dtype=torch.float64))
     assert centers[:, 0].min() >= -2 * BEYOND and centers[:, 0].max() <= 2 + 2 * BEYOND
     assert centers[:, 0].min() < 0 < 2 < centers[:, 0].max()
@@ -185,37 +193,20 @@ def sights(cameras: list[Camera]) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_rotations_turn_by_part_of_the_angle_and_a_little_beyond():
-    turned = Camera(8, 8, 8.0, 8.0, 4.0, 4.0, torch.eye(4))
-    turned.viewmat[:3, :3] = rotation_matrix(torch.tensor([0.0, 0.5, 0.0], dtype=torch.float64))
-    straight = Camera(8, 8, 8.0, 8.0, 4.0, 4.0, torch.eye(4))
-    for view in jittered([straight, turned], 10, seeded(), amount=0.0):
+    for view in jittered([straight(), straight(turn=0.5)], 10, seeded(), amount=0.0):
         x, y, z = rotation_vector(view.viewmat[:3, :3]).tolist()
         assert (x, z) == pytest.approx((0, 0), abs=1e-12)
         assert -0.5 * BEYOND <= y <= 0.5 * (1 + BEYOND)
 
 
 def test_cameras_that_look_apart_are_not_mixed():
-    back = rotation_matrix(torch.tensor([0.0, math.pi, 0.0], dtype=torch.float64))
-    turned = Camera(8, 8, 8.0, 8.0, 4.0, 4.0, torch.eye(4))
-    turned.viewmat[:3, :3] = back
-    views = jittered([Camera(8, 8, 8.0, 8.0, 4.0, 4.0, torch.eye(4)), turned], 10, seeded(), amount=0.0)
+    views = jittered([straight(), straight(turn=math.pi)], 10, seeded(), amount=0.0)
     assert forwards(views)[:, 2].abs().min() > 1 - 1e-12
 
 
 def test_the_widest_gap_between_cameras_is_filled_first():
-    cameras = []
-    for x in (0.0, 0.1, 0.2, 0.3, 0.4, 1.5):
-        cameras.append(Camera(8, 8, 8.0, 8.0, 4.0, 4.0, torch.eye(4, dtype=torch.float64)))
-        cameras[-1].viewmat[0, 3] = -x
-    views = jittered(cameras, 4, seeded(), amount=0.0)
+    views = jittered(on_a_line(0.0, 0.1, 0.2, 0.3, 0.4, 1.5), 4, seeded(), amount=0.0)
     assert sum(0.6 < view.center[0] < 1.4 for view in views) >= 2
-
-
-def on_a_line(*places: float) -> list[Camera]:
-    cameras = [Camera(8, 8, 8.0, 8.0, 4.0, 4.0, torch.eye(4)) for _ in places]
-    for camera, x in zip(cameras, places, strict=True):
-        camera.viewmat[0, 3] = -x
-    return cameras
 
 
 @pytest.mark.parametrize("far", [[100.0 + step for step in range(6)], [100.0]], ids=["another room", "a stray camera"])
