@@ -52,10 +52,18 @@ def test_p1_averages_colors_and_alpha_by_themselves_and_composites_afterwards(tm
     assert torch.equal(view.truth(1 / 2, PROTOCOLS["P3"]), PROTOCOLS["P3"].shrunk(view.photograph, (12, 16)))
 
 
-def test_p1_of_a_photograph_without_whole_blocks_says_what_to_do():
-    view = protocols.TestView(tiny.cameras(1)[0], noise(25, 33, 3), Path("photograph.png"))
-    with pytest.raises(SettingsError, match=r"P1 takes means of whole blocks .*33 x 25 px is not a whole multiple of 8 x 6 px; evaluate by P3"):
-        view.truth(1 / 4, PROTOCOLS["P1"])
+@pytest.mark.parametrize(
+    ("protocol", "size", "scale", "told"),
+    [
+        ("P1", (25, 33), 1 / 4, "P1 takes means of whole blocks .*33 x 25 px is not a whole multiple of 8 x 6 px; evaluate by P3"),
+        ("P3", (24, 32), 2, "x2 needs 64 x 48 px, but the photographs have only 32 x 24; evaluate a smaller scale"),
+    ],
+    ids=["without whole blocks", "too small"],
+)
+def test_a_photograph_of_which_there_is_no_truth_says_what_to_do(protocol, size, scale, told):
+    view = protocols.TestView(tiny.cameras(1)[0], noise(*size, 3), Path("photograph.png"))
+    with pytest.raises(SettingsError, match=told):
+        view.truth(scale, PROTOCOLS[protocol])
 
 
 def test_p3_is_pillows_bicubic_on_bytes_and_not_on_floats():
@@ -74,12 +82,6 @@ def test_images_are_judged_as_the_8_bit_files_that_they_would_be_saved_as():
     views = [protocols.TestView(tiny.cameras(1)[0], torch.full((24, 32, 3), 100 / 255), Path("photograph.png"))]
     row = Evaluator(views, PROTOCOLS["P3"]).row("gray", 1, lambda camera: torch.full((*camera.size, 3), 100.4 / 255), gaussians=0)
     assert row.psnr_db == SAME_DB
-
-
-def test_a_truth_finer_than_the_photograph_is_refused():
-    view = protocols.TestView(tiny.cameras(1)[0], noise(24, 32, 3), Path("photograph.png"))
-    with pytest.raises(SettingsError, match="x2 needs 64 x 48 px, but the photographs have only 32 x 24; evaluate a smaller scale"):
-        view.truth(2, PROTOCOLS["P3"])
 
 
 @pytest.mark.parametrize(("size", "divisor"), [((3286, 4946), 8), ((3361, 5187), 2), ((2078, 3118), 4), ((5992, 4004), 8)])
