@@ -112,6 +112,13 @@ def test_p4_reads_the_copy_that_has_the_size(folders, scale, value):
     torch.testing.assert_close(truth, torch.full_like(truth, value), atol=1e-3, rtol=0)
 
 
+def test_p4_takes_copies_whose_size_differs_by_rounding_alone(folders):
+    photograph = folders / "images" / "left" / "a.png"
+    assert protocols.ready_made(photograph, (28, 33)) == folders / "images_4" / "left" / "a.png"
+    with pytest.raises(SettingsError, match=r"P4 needs a\.png at 33 x 29 px"):
+        protocols.ready_made(photograph, (29, 33))
+
+
 def test_p4_refuses_a_size_that_no_folder_has(folders, tmp_path):
     view = protocols.TestView(tiny.cameras(1)[0], noise(97, 130, 3), folders / "images" / "left" / "a.png")
     with pytest.raises(SettingsError, match=r"P4 needs a\.png at 16 x 12 px .* but there is 130 x 97, 65 x 49, 33 x 24; evaluate a"):
