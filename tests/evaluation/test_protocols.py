@@ -52,10 +52,18 @@ def test_p1_averages_colors_and_alpha_by_themselves_and_composites_afterwards(tm
     assert torch.equal(view.truth(1 / 2, PROTOCOLS["P3"]), PROTOCOLS["P3"].shrunk(view.photograph, (12, 16)))
 
 
-def test_p1_of_a_photograph_without_whole_blocks_says_what_to_do():
-    view = protocols.TestView(tiny.cameras(1)[0], noise(25, 33, 3), Path("photograph.png"))
-    with pytest.raises(SettingsError, match=r"P1 takes means of whole blocks .*33 x 25 px is not a whole multiple of 8 x 6 px; evaluate by P3"):
-        view.truth(1 / 4, PROTOCOLS["P1"])
+@pytest.mark.parametrize(
+    ("protocol", "size", "scale", "told"),
+    [
+        ("P1", (25, 33), 1 / 4, "P1 takes means of whole blocks .*33 x 25 px is not a whole multiple of 8 x 6 px; evaluate by P3"),
+        ("P3", (24, 32), 2, "x2 needs 64 x 48 px, but the photographs have only 32 x 24; evaluate a smaller scale"),
+    ],
+    ids=["without whole blocks", "too small"],
+)
+def test_a_photograph_of_which_there_is_no_truth_says_what_to_do(protocol, size, scale, told):
+    view = protocols.TestView(tiny.cameras(1)[0], noise(*size, 3), Path("photograph.png"))
+    with pytest.raises(SettingsError, match=told):
+        view.truth(scale, PROTOCOLS[protocol])
 
 
 def test_p3_is_pillows_bicubic_on_bytes_and_not_on_floats():
@@ -76,21 +84,16 @@ def test_images_are_judged_as_the_8_bit_files_that_they_would_be_saved_as():
     assert row.psnr_db == SAME_DB
 
 
-def test_a_truth_finer_than_the_photograph_is_refused():
-    view = protocols.TestView(tiny.cameras(1)[0], noise(24, 32, 3), Path("photograph.png"))
-    with pytest.raises(SettingsError, match="x2 needs 64 x 48 px, but the photographs have only 32 x 24; evaluate a smaller scale"):
-        view.truth(2, PROTOCOLS["P3"])
-
-
 @pytest.mark.parametrize(("size", "divisor"), [((3286, 4946), 8), ((3361, 5187), 2), ((2078, 3118), 4), ((5992, 4004), 8)])
-def test_a_photograph_is_large_enough_for_a_base_whose_size_was_rounded_up(size, divisor):
-    """Captures of mip-NeRF 360, trained at half, a quarter and an eighth of their size, as in the tables of zoom-in."""
+def test_a_photograph_is_large_enough_for_a_base_whose_size_was_rounded_up(monkeypatch, size, divisor):
+    """Captures of mip-NeRF 360, trained at half, a quarter and an eighth of their size, halves rounded up. None is shrunk here, which takes long."""
+    monkeypatch.setattr(protocols.Protocol, "shrunk", lambda self, photograph, size: size)
     height, width = size
     full = Camera(width, height, 4000.0, 4000.0, width / 2, height / 2, torch.eye(4), "view", "test")
-    base = full.resized(round(width / divisor), round(height / divisor))
+    base = full.resized(int(width / divisor + 0.5), int(height / divisor + 0.5))
     [camera] = at_density_of([full], [base])
-    view = protocols.TestView(camera, torch.zeros(*size, 3), Path("photograph.png"))
-    assert view.truth(divisor, PROTOCOLS["P3"]).shape[:2] == camera.zoomed(divisor).size
+    view = protocols.TestView(camera, torch.zeros(1).expand(*size, 3), Path("photograph.png"))
+    assert view.truth(divisor, PROTOCOLS["P3"]) == camera.zoomed(divisor).size
 
 
 @pytest.fixture
@@ -107,6 +110,13 @@ def test_p4_reads_the_copy_that_has_the_size(folders, scale, value):
     truth = view.truth(scale, PROTOCOLS["P4"])
     assert truth.shape == (24 * scale, 33 * scale, 3)
     torch.testing.assert_close(truth, torch.full_like(truth, value), atol=1e-3, rtol=0)
+
+
+def test_p4_takes_copies_whose_size_differs_by_rounding_alone(folders):
+    photograph = folders / "images" / "left" / "a.png"
+    assert protocols.ready_made(photograph, (28, 33)) == folders / "images_4" / "left" / "a.png"
+    with pytest.raises(SettingsError, match=r"P4 needs a\.png at 33 x 29 px"):
+        protocols.ready_made(photograph, (29, 33))
 
 
 def test_p4_refuses_a_size_that_no_folder_has(folders, tmp_path):

@@ -48,22 +48,24 @@ def test_a_file_of_no_splats(tmp_path):
     assert "holds no splats" in sentence(gltf_files.glb(tmp_path / "a.glb", tiny.gaussians(0)))
 
 
-@pytest.mark.parametrize("missing", ["SH_DEGREE_1_COEF_2", "SH_DEGREE_2_COEF_0"])
-def test_degrees_have_to_be_whole(tmp_path, missing):
+@pytest.mark.parametrize(
+    ("missing", "told"),
+    [
+        (["SH_DEGREE_1_COEF_2"], "its degrees of spherical harmonics are not whole"),
+        (["SH_DEGREE_2_COEF_0"], "its degrees of spherical harmonics are not whole"),
+        (["SCALE", "OPACITY"], "lacks SCALE, COLOR_0"),
+    ],
+)
+def test_missing_attributes_are_told_of(tmp_path, missing, told):
     named = gltf_files.attributes(tiny.gaussians(degree=3))
-    del named[f"{EXTENSION}:{missing}"]
-    assert "its degrees of spherical harmonics are not whole" in sentence(gltf_files.write_glb(tmp_path / "a.glb", *gltf_files.document(named)))
+    for name in missing:
+        del named[f"{EXTENSION}:{name}"]
+    assert told in sentence(gltf_files.write_glb(tmp_path / "a.glb", *gltf_files.document(named)))
 
 
 def test_a_tileset_names_its_tiles(tmp_path):
     (tmp_path / "tileset.json").write_text(json.dumps({"asset": {"version": "1.1"}, "geometricError": 1, "extensionsUsed": [EXTENSION]}))
     assert "is the tileset of 3D Tiles; give one of its tiles" in sentence(tmp_path / "tileset.json")
-
-
-def test_missing_attributes_are_named(tmp_path):
-    named = gltf_files.attributes(tiny.gaussians())
-    del named[f"{EXTENSION}:SCALE"], named[f"{EXTENSION}:OPACITY"]
-    assert "lacks SCALE, COLOR_0" in sentence(gltf_files.write_glb(tmp_path / "a.glb", *gltf_files.document(named)))
 
 
 def test_a_file_that_is_cut_off_is_damaged(tmp_path):

@@ -38,6 +38,11 @@ def test_body_that_starts_with_a_newline_byte_after_a_cr_header(tmp_path):
     assert file.columns["x"].tobytes() == value.tobytes()
 
 
+def test_line_breaks_may_be_mixed_and_the_last_one_missing(tmp_path):
+    (tmp_path / "a.ply").write_bytes(b"ply\nformat ascii 1.0\r\nelement vertex 2\nproperty float x\r\nend_header\r\n3\n4")
+    assert read_ply(tmp_path / "a.ply").columns["x"].tolist() == [3, 4]
+
+
 def test_mixed_types_keep_their_values(tmp_path):
     columns = {"x": np.array([0.1]), "id": np.array([2**31 - 1], np.int32), "red": np.array([255], np.uint8)}
     held = read_ply(write(tmp_path / "a.ply", columns)).columns
@@ -98,6 +103,9 @@ MALFORMED = {
     "keyword": (header("format ascii 1.0", "elephant", "end_header"), "line 3 .* cannot be read: 'elephant'"),
     "type": (header("format ascii 1.0", "element vertex 1", "property half x", "end_header"), "line 4 .* type half PLY does not have; export"),
     "property first": (header("format ascii 1.0", F4, "end_header"), "line 3 .* cannot be read"),
+    "no type": (header("format ascii 1.0", "element vertex 1", "property x", "end_header"), "line 4 .* cannot be read: 'property x'"),
+    "two types": (header("format ascii 1.0", "element vertex 1", "property float float x", "end_header"), "line 4 .* cannot be read"),
+    "list of one type": (header("format ascii 1.0", "element vertex 1", "property list float x", "end_header"), "type list PLY does not have"),
     "twice": (header("format ascii 1.0", "element vertex 1", F4, F4, "end_header"), "line 5 .* read: .*, the second property of this name; export"),
     "negative": (header("format ascii 1.0", "element vertex -1", F4, "end_header"), "line 3 .* cannot be read"),
     "no count": (header("format ascii 1.0", "element vertex", F4, "end_header"), "line 3 .* cannot be read"),

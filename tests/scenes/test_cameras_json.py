@@ -157,8 +157,17 @@ def test_training_size_of_flowers(cfg, size):
     assert trained_size(5025, 3312, cfg) == size
 
 
-def test_a_width_of_1600_is_not_capped():
-    assert trained_size(1600, 900, {"resolution": -1}) == (1600, 900)
+@pytest.mark.parametrize(
+    ("size", "cfg", "trained"),
+    [
+        ((1600, 900), {"resolution": -1}, (1600, 900)),  # not capped
+        ((100, 3), {"resolution": 10}, (10, 1)),
+        ((3, 3), {"resolution": 8}, (1, 1)),
+        ((3, 3), {"images": "images_8"}, (1, 1)),
+    ],
+)
+def test_no_side_is_enlarged_and_none_becomes_0(size, cfg, trained):
+    assert trained_size(*size, cfg) == trained
 
 
 @pytest.mark.parametrize("resolution", [0, -2, "half", None])

@@ -27,7 +27,7 @@ def test_a_principal_point_in_a_cameras_json_is_read(tmp_path):
 
 @pytest.mark.parametrize(
     ("cx", "cy", "said"),
-    [(0.5, 0.5, ": has cx 0.5 and cy 0.5, but must have pixels"), (-0.02, None, ": has cx -0.02, but must"), ("left", 11.0, ", cx: is not")],
+    [(0.5, 1.0, ": has cx 0.5 and cy 1, but must have pixels"), (-0.02, None, ": has cx -0.02, but must"), ("left", 11.0, ", cx: is not")],
 )
 def test_a_principal_point_in_other_units_is_refused(tmp_path, cx, cy, said):
     path = write_cameras(tmp_path / "cameras.json", [replace(tiny.cameras(1)[0], cx=11.0, cy=15.0)])

@@ -138,6 +138,20 @@ def test_in_a_file_of_nerfstudio_a_frames_own_lens_has_no_part_of_another(tmp_pa
     assert (camera.fx, camera.fy) == (50.0, 50.0)
 
 
+def test_a_lens_that_is_said_to_be_a_fisheye_is_one(tmp_path):
+    """As instant-ngp says it, which has no `camera_model`."""
+    data = {"is_fisheye": True, "k1": 0.1, "k4": 0.4, "fl_x": 9.0, "w": 8, "h": 6, "frames": [frame()]}
+    save_image(tmp_path / "train/r_0.png")
+    [lens] = read_transforms(write_json(tmp_path / "transforms.json", data)).lenses.values()
+    assert (lens.model, lens.params[4:]) == ("OPENCV_FISHEYE", (0.1, 0.0, 0.0, 0.4))
+
+
+@pytest.mark.parametrize(("name", "split"), [("a_test", "test"), ("transforms_val", "test"), ("transforms_train", "train"), ("a", "train")])
+def test_the_name_of_a_lone_file_says_its_split(tmp_path, name, split):
+    path = write_json(tmp_path / f"{name}.json", {"fl_x": 9.0, "w": 8, "h": 6, "frames": [frame()]})
+    assert [camera.split for camera in read_transforms(path).cameras] == [split]
+
+
 def test_distortion_may_be_a_list(tmp_path):
     """Its numbers were passed over without a word."""
     data = {"distortion_params": [0.1, 0, 0, 0, 0, 0], "k1": 0.3, "fl_x": 9.0, "frames": [frame()]}

@@ -74,11 +74,17 @@ def test_an_interrupted_tile_is_resumed(job, monkeypatch):
     assert adapt_in_tiles(job, 2).file.exists() and first_steps == [2, 1]
 
 
-def test_tiles_of_another_request_are_not_touched(job):
+@pytest.mark.parametrize(
+    ("plan", "error", "told"),
+    [("{}", SettingsError, "holds tiles of another base, settings or number of tiles"), ("", SceneError, r"plan\.json: is not JSON")],
+    ids=["of another request", "damaged"],
+)
+def test_tiles_of_another_plan_are_not_touched(job, plan, error, told):
     work_folder(job.target).mkdir()
-    (work_folder(job.target) / "plan.json").write_text("{}")
-    with pytest.raises(SettingsError, match="holds tiles of another base, settings or number of tiles"):
+    (work_folder(job.target) / "plan.json").write_text(plan)
+    with pytest.raises(error, match=told):
         adapt_in_tiles(job, 2)
+    assert (work_folder(job.target) / "plan.json").read_text() == plan
 
 
 def test_tiles_of_a_version_that_cut_across_sizes_are_refused(job):
@@ -111,13 +117,6 @@ def test_saving_the_base_leaves_the_starts_to_the_next_run(job, monkeypatch):
         adapt_in_tiles(job, 2)
     starts = Store(folder / "start_0.splats").parameters()["opacities"]
     assert not torch.equal(starts, load_vanilla(folder / "part_0.ply").parameters()["opacities"])
-
-
-def test_a_damaged_plan_is_said_in_a_sentence(job):
-    work_folder(job.target).mkdir()
-    (work_folder(job.target) / "plan.json").write_text("")
-    with pytest.raises(SceneError, match=r"plan\.json: is not JSON"):
-        adapt_in_tiles(job, 2)
 
 
 def test_what_an_earlier_command_did_stays_where_views_are_refused(job, monkeypatch):

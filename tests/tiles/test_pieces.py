@@ -59,6 +59,7 @@ def test_every_splat_lies_in_exactly_one_core_of_equal_size(count):
 @pytest.mark.parametrize("away", [0.0, 1e4])
 def test_a_cut_is_a_plane_across_the_longest_axis_which_far_strays_do_not_decide(away):
     means = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 9.0, 1.0])
+    means[:, 2] += 50
     means[:5, 0] += away
     (low, high), _ = cut(means, torch.arange(500), 2)
     assert means[low, 1].max() <= means[high, 1].min()
@@ -75,9 +76,10 @@ def test_sizes_of_splats_do_not_decide_where_a_scene_is_cut(tmp_path):
 
 @pytest.mark.parametrize("count", [2, 5, 8])
 def test_a_core_is_before_all_that_it_may_hide(count):
-    """Every line of sight meets the cores in their order."""
+    """Every line of sight meets the cores, which its planes keep apart, in their order."""
     generator = torch.Generator().manual_seed(0)
-    _, tree = cut(torch.randn(800, 3, generator=generator), torch.arange(800), count)
+    means = torch.randn(800, 3, generator=generator)
+    cores, tree = cut(means, torch.arange(800), count)
     center = torch.tensor([0.3, -0.2, 0.1])
     order = front_to_back(tree, center.tolist())
     assert sorted(order) == list(range(count))
@@ -85,6 +87,7 @@ def test_a_core_is_before_all_that_it_may_hide(count):
     def core_at(point, node=tree):
         return node if isinstance(node, int) else core_at(point, node[2] if point[node[0]] <= node[1] else node[3])
 
+    assert all(core_at(mean) == number for number, core in enumerate(cores) for mean in means[core])
     for sight in torch.randn(50, 3, generator=generator):
         met = [order.index(core_at(center + distance * sight)) for distance in torch.linspace(0, 3, 40)]
         assert met == sorted(met)

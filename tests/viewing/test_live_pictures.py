@@ -173,17 +173,17 @@ def test_a_ladder_shows_the_level_of_the_zoom(tmp_path, base, screen):
     assert torch.equal(levels.render(Request(screen, 0.5)), alone.render(Request(screen, 0.5)))
 
 
-def test_a_ladder_by_distance_is_refused(tmp_path, base):
-    """A picture of it has a level for each distance."""
-    (tmp_path / "levels.json").write_text('{"by": "distance", "levels": [{"file": "level_0.ply", "distance_from": 0}]}')
-    with pytest.raises(SceneError, match=r"by distance.* give a file of it"):
-        open_source(tmp_path, base, "reference")
+DAMAGED = ['{"levels": []}', "[]", '{"levels": [{"file": "level_0.ply"}]}', '{"levels": [{"file": "a", "shown_from": "b"}]}']
+BY_DISTANCE = '{"by": "distance", "levels": [{"file": "level_0.ply", "distance_from": 0}]}'  # whose picture has a level for each distance
 
 
-@pytest.mark.parametrize("text", ['{"levels": []}', "[]", '{"levels": [{"file": "level_0.ply"}]}', '{"levels": [{"file": "a", "shown_from": "b"}]}'])
-def test_a_damaged_ladder_is_refused(tmp_path, base, text):
+NO_LEVELS = "lists no levels, or is damaged"
+
+
+@pytest.mark.parametrize(("text", "told"), [*((text, NO_LEVELS) for text in DAMAGED), (BY_DISTANCE, "by distance.* give a file of it")])
+def test_a_ladder_that_is_damaged_or_by_distance_is_refused(tmp_path, base, text, told):
     (tmp_path / "levels.json").write_text(text)
-    with pytest.raises(SceneError, match="lists no levels, or is damaged"):
+    with pytest.raises(SceneError, match=told):
         open_source(tmp_path, base, "reference")
 
 
