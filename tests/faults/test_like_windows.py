@@ -5,20 +5,23 @@ from __future__ import annotations
 import errno
 import io
 import os
+from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import like_windows
 import pytest
 import tiny
 
-from mipmap_plugin import cli
+from mipmap_plugin import cli, errors
 from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.errors import OutputError
 from mipmap_plugin.formats import here, staging
-from mipmap_plugin.formats.atomic import new_file, write_json
+from mipmap_plugin.formats.atomic import new_file, together, write_json
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job
+from mipmap_plugin.jobs.listing import read_list
 from mipmap_plugin.jobs.worker import Worker, WorkerDied
 
 NO_PROC = not os.path.isdir("/proc/self/fd")
@@ -80,6 +83,24 @@ def test_as_many_runs_as_there_is_room_for_keep_apart(tmp_path, refused):
     for each in living:
         each.close()
     assert not any(tmp_path.iterdir())
+
+
+def test_what_is_open_elsewhere_is_replaced_with_its_report_or_not_at_all(tmp_path, monkeypatch, refused):
+    monkeypatch.setattr(errors, "os", SimpleNamespace(name="nt"))
+    report = tmp_path / "out.ply.json"
+    for text in ("old", "new"):
+        opened = (tmp_path / "out.ply").open("rb") if text == "new" else nullcontext()
+        said = pytest.raises(OutputError, match="used by another process; close it where it is open, or choose") if text == "new" else nullcontext()
+        with opened, said, together(tmp_path / "out.ply"):
+            for file in (tmp_path / "out.ply", report):
+                with new_file(file, overwrite=True) as temporary:
+                    temporary.write_text(text)
+    assert report.read_text() == (tmp_path / "out.ply").read_text() == "old" and len([*tmp_path.iterdir()]) == 2
+
+
+def test_a_list_that_powershell_wrote_is_read(tmp_path):
+    (tmp_path / "list.txt").write_bytes("output/città\r\n".encode("utf-16"))
+    assert read_list(tmp_path / "list.txt") == [Path("output/città")]
 
 
 def test_names_of_pictures_are_of_characters_that_it_takes_and_differ_in_more_than_capitals():

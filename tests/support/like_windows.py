@@ -1,4 +1,4 @@
-"""The file system of Windows, as strict as it is there: what is open or mapped is neither moved, nor replaced, nor removed, and no folder is opened."""
+"""The file system of Windows, as strict as it is there: what is open or mapped is not moved, replaced or removed, and no folder is opened."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def pretend(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     def rename(source, target, real=os.rename):
         free(source)
-        if os.path.lexists(target):
+        if os.path.lexists(target) and source != target:
             raise FileExistsError(errno.EEXIST, "it exists already", str(target))
         real(source, target)
 
