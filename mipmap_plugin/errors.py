@@ -2,6 +2,7 @@
 
 import difflib
 import errno
+import os
 import re
 import sys
 import traceback
@@ -21,7 +22,7 @@ IRREGULAR = {"are": "is", "were": "was", "have": "has"}
 
 def install(extra: str) -> str:
     """How to install an extra, in words for whoever has a clone of the repository and for whoever has none."""
-    return f"run pip install '.[{extra}]' in a clone of the repository, or pip install 'mipmap-plugin[{extra}]' elsewhere"
+    return f'run pip install ".[{extra}]" in a clone of the repository, or pip install "mipmap-plugin[{extra}]" elsewhere'
 
 
 class MipmapPluginError(Exception):
@@ -93,7 +94,8 @@ REMEDIES = {
 
 def of_system(error: OSError) -> str:
     """What the system says of an error, and what to do about it."""
-    return f"{error.strerror or error}; {REMEDIES.get(error.errno or 0, 'choose another path')}"
+    close = "close it where it is open, or " if isinstance(error, PermissionError) and os.name == "nt" else ""
+    return f"{error.strerror or error}; {close}{REMEDIES.get(error.errno or 0, 'choose another path')}"
 
 
 def of_a_file(error: OSError) -> str:

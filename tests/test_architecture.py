@@ -265,7 +265,19 @@ def test_the_library_neither_prints_nor_evaluates_text():
 
 def test_one_sentence_says_how_to_install_an_extra():
     """It is right in a clone too, from which the README installs."""
-    assert [name_of(path) for path in MODULES if re.search(r"pip install '(mipmap-plugin|\.)\[", path.read_text(encoding="utf-8"))] == ["errors.py"]
+    told = re.compile(r"""pip install ["'](mipmap-plugin|\.)\[""")
+    assert [name_of(path) for path in MODULES if told.search(path.read_text(encoding="utf-8"))] == ["errors.py"]
+
+
+def test_text_is_read_and_written_in_an_encoding_that_is_named():
+    """Windows would take its own."""
+
+    def unnamed(path: Path) -> list[str]:
+        calls = [node for node in nodes(path) if isinstance(node, ast.Call) and not {word.arg for word in node.keywords} & {"encoding", None}]
+        of_text = [call for call in calls if ast.unparse(call.func).endswith((".read_text", ".write_text"))]
+        return [ast.unparse(call) for call in (*of_text, *(call for call in calls if any(word.arg == "text" for word in call.keywords)))]
+
+    assert offenders(unnamed) == {}
 
 
 def test_annotations_of_stable_names_can_be_evaluated():

@@ -78,7 +78,7 @@ def adapt(
     """Make a checkpoint that looks right at another scale, in the viewer that it is opened in.
 
     Args:
-        checkpoints: A PLY, .spz, .sog, .splat or .glb, or a model folder; or several, also as patterns such as 'output/*'.
+        checkpoints: A PLY, .spz, .sog, .splat or .glb, or a model folder; or several, also as patterns such as "output/*".
         scale: Target focal length over base focal length, such as 1/4 or 4; may be given several times. Required without --splats or --bytes.
         output: Where to write; by default beside the checkpoint, as NAME_x0.25. With several scales or viewers: a folder for all files.
         recipe: default; thorough (more steps and views); instant (closed form only, seconds); paper (the published method); or a registered one.

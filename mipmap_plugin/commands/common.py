@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from mipmap_plugin.commands.voice import put, say
 from mipmap_plugin.errors import warn
 from mipmap_plugin.formats.atomic import json_text
-from mipmap_plugin.formats.here import from_here
+from mipmap_plugin.formats.here import from_here, typed
 from mipmap_plugin.process.garbage import leave_loaded, uncollected
 from mipmap_plugin.progress import announced
 
@@ -29,7 +28,7 @@ WORDS: ContextVar[tuple[str, ...]] = ContextVar("WORDS", default=())
 
 def this_command() -> str:
     """The command as a shell takes it."""
-    return shlex.join(["mipmap-plugin", *WORDS.get()])
+    return typed(["mipmap-plugin", *WORDS.get()])
 
 
 def wrap(base: Base, threads: int | None = None) -> Wrapped:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from mipmap_plugin.commands.common import base_cameras, print_facts, print_json
 from mipmap_plugin.commands.types import Cameras, Checkpoint, ScreenFilter, Up
 from mipmap_plugin.errors import PluginError, plural
+from mipmap_plugin.formats.here import typed
 from mipmap_plugin.jobs.base import COLORS
 from mipmap_plugin.process.garbage import uncollected
 from mipmap_plugin.progress import announced
@@ -146,15 +146,15 @@ def _advice(wrapped: Wrapped, checkpoint: Path, given: Path | None) -> str:
     named = f"./{checkpoint}" if str(checkpoint).startswith("-") else str(checkpoint)  # or it would be taken for an option
     if _adapted_to(wrapped) is not None:  # the scale that it is drawn at unless another is given
         own = [] if given is None else ["--cameras", str(given)]
-        return shlex.join(["mipmap-plugin", "render", named, "--output", "DIR", *own])
-    words = ["mipmap-plugin", "adapt", shlex.quote(named), "--scale", "1/4"]
+        return typed(["mipmap-plugin", "render", named, "--output", "DIR", *own])
+    words = ["mipmap-plugin", "adapt", named, "--scale", "1/4"]
     if told := wrapped.asked["screen filter"]:
         words += ["--screen-filter", told]
     if given is None and not wrapped.cameras and (up := wrapped.asked.get("up")):
         words += ["--up", up]
     elif given is not None or not wrapped.cameras:
-        words += ["--cameras", shlex.quote(str(given or unread_cameras(wrapped.model.source) or "SCENE"))]
-    return " ".join(words)
+        words += ["--cameras", str(given or unread_cameras(wrapped.model.source) or "SCENE")]
+    return typed(words)
 
 
 def _off(effects: Sequence[Effect], *, shown: bool) -> list[str]:

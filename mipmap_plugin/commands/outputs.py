@@ -14,6 +14,9 @@ from mipmap_plugin.formats.splat_transform import WRITTEN
 if TYPE_CHECKING:
     from mipmap_plugin.camera import Camera
 
+# What separates folders, and what Windows takes in no name.
+REPLACED = str.maketrans(dict.fromkeys('/\\:*?"<>|', "_"))
+
 
 def adapted_path(checkpoint: Path, output: Path | None, scale: float, viewer: str | None = None, *, several: bool) -> Path:
     """The path of an adapted model: beside the checkpoint as NAME_x0.25 or NAME_x0.25_spark (`adapted_name`), or `output`; a folder for all if
@@ -34,12 +37,15 @@ def folder_of_several(output: Path, endings: tuple[str, ...]) -> Path:
 
 
 def picture_names(views: Sequence[Camera]) -> list[str]:
-    """The name of a PNG file for each view, unique and without a folder; views of the same name are numbered."""
-    names = [f"{view.split}_{view.name}".replace("/", "_").replace("\\", "_") for view in views]
-    counts = Counter(names)
+    """The name of a PNG file for each view that every system takes, unique and without a folder; views of the same name are numbered.
+
+    Names that differ in capitals alone are the same to Windows and macOS.
+    """
+    names = [f"{view.split}_{view.name}".translate(REPLACED) for view in views]
+    counts = Counter(name.casefold() for name in names)
     taken = set(counts)
     for i, name in enumerate(names):
-        if counts[name] > 1:
-            names[i] = next(numbered for number in count_from(1) if (numbered := f"{name}_{number}") not in taken)
-            taken.add(names[i])
+        if counts[name.casefold()] > 1:
+            names[i] = next(numbered for number in count_from(1) if (numbered := f"{name}_{number}").casefold() not in taken)
+            taken.add(names[i].casefold())
     return [f"{name}.png" for name in names]

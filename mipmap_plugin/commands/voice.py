@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import os
 import shutil
@@ -73,8 +74,8 @@ def put(text: str) -> None:
         print(text, file=out, flush=True)
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())  # otherwise Python reports the error again when it exits
-        if isinstance(error, BrokenPipeError):
-            raise
+        if isinstance(error, BrokenPipeError) or error.errno == errno.EINVAL:  # as Windows says it
+            raise BrokenPipeError from error
         raise OutputError(f"the standard output cannot be written ({error.strerror}); print to another place") from error
 
 

@@ -230,7 +230,7 @@ def _around(file: Path, folders: bool) -> Iterator[os.stat_result]:
 def write_json(path: Path, facts: Any, overwrite: bool) -> None:
     """Write `facts` as an indented JSON file (`json_text`). Raises OutputExists, OutputError."""
     with new_file(path, overwrite) as temporary:
-        temporary.write_text(json_text(facts) + "\n", encoding="utf-8")
+        temporary.write_text(json_text(facts) + "\n", encoding="utf-8", newline="\n")  # the same bytes on every system
 
 
 def json_text(facts: Any) -> str:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
+import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 
 
@@ -19,6 +22,11 @@ def told_from_here(text: str) -> str:
     except FileNotFoundError:  # the current directory was deleted: no path lies in it
         return text
     return re.sub(rf"(?<![^\s'\"(]){here}", "", text)
+
+
+def typed(words: Sequence[str]) -> str:
+    """The words of a command as they are typed in a shell: that of Windows knows double quotes only."""
+    return subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words)
 
 
 def size_in_bytes(count: int) -> str:

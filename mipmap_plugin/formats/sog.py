@@ -96,7 +96,7 @@ def completed(source: Path, folder: Path) -> Path:
         for name in (Path(name).name for part in meta.values() if isinstance(part, dict) for name in part.get("files", ())):
             shutil.copyfile(source.with_name(name), folder / name)
         copy = folder / source.name
-        copy.write_text(json.dumps(meta))
+        copy.write_text(json.dumps(meta), encoding="utf-8")
         return copy
     except DAMAGE as error:
         if isinstance(error, OSError) and error.errno in FULL:

@@ -189,7 +189,7 @@ def find_tool() -> list[str] | None:
 def answer(command: Sequence[str]) -> str | None:
     """What a program prints within a minute; None if it cannot be started, or fails."""
     try:
-        told = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=60, check=False)
+        told = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace", timeout=60, check=False)
     except (OSError, subprocess.TimeoutExpired):
         return None
     return told.stdout + told.stderr if told.returncode == 0 else None
@@ -200,7 +200,7 @@ def _run(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str
     options = ["--gpu", "cpu", *(["--spz-version", SPZ_VERSION] if is_spz(target) else [])]
     command = [*tool, "--quiet", "--overwrite", *options, *map(str, inputs), str(target)]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=LONGEST, check=False)
+        done = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace", timeout=LONGEST, check=False)
     except subprocess.TimeoutExpired:
         return f"not ready after {LONGEST // 60} minutes"
     except OSError as error:

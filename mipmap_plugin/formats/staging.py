@@ -12,6 +12,7 @@ import ctypes
 import errno
 import os
 import shutil
+import stat
 import sys
 import time
 from collections.abc import Iterable
@@ -22,8 +23,11 @@ from pathlib import Path
 # The most runs that may write to one output at the same time.
 SLOTS = 8
 
-# Seconds after which a folder counts as that of a killed run on systems without locks.
+# Seconds after which a folder counts as that of a killed run on disks without locks.
 STALE_S = 24 * 3600.0
+
+# Windows opens no folders. There a run holds this file in its folder open, which nobody can remove then; that of a killed run is closed.
+HELD = "held"
 
 # Linux: renameat2 with paths relative to the working folder, and the flag that exchanges them (linux/fs.h).
 AT_FDCWD = -100
@@ -64,6 +68,9 @@ class Staging:
         if self.new / self.path.name in made:
             _note_spent(self._folder, [path for path in spent if path.parent == self.place])
         if not (len(made) == 1 and _moved_at_once(made[0], self.place / made[0].name)):
+            for target in (self.place / each.name for each in made):
+                if target.is_file():
+                    os.rename(target, target)  # nothing; an error on Windows, if it is open, so that none is replaced unless all are
             ready = self._folder / "ready"
             os.rename(self.new, ready)
             try:
@@ -94,8 +101,11 @@ def claim(folder: Path) -> int | None:
             lock = os.open(folder, os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_NOFOLLOW", 0))
         except FileNotFoundError:  # its run has ended at this moment
             continue
-        except PermissionError:  # Windows opens no folders
-            return -1 if made or _is_stale(folder.stat()) else None
+        except PermissionError:  # Windows
+            try:
+                return _held_file(folder / HELD)
+            except FileNotFoundError:  # as above
+                continue
         if not _locked(lock, made):
             os.close(lock)
             return None
@@ -107,11 +117,13 @@ def claim(folder: Path) -> int | None:
 def release(folder: Path, lock: int) -> None:
     """Give back what `claim` took, and remove it, if it is still there."""
     try:
-        if lock < 0 or _is_of(lock, folder):
+        if _is_of(lock, folder):
             shutil.rmtree(folder, ignore_errors=True)
     finally:
-        if lock >= 0:
-            os.close(lock)
+        os.close(lock)
+    with suppress(OSError):  # on Windows, what was open until now; another run may hold it already
+        (folder / HELD).unlink()
+        folder.rmdir()
 
 
 def missing_folders(folder: Path) -> list[Path]:
@@ -171,10 +183,19 @@ def _locked(lock: int, made: bool) -> bool:
     return True
 
 
+def _held_file(file: Path) -> int | None:
+    """The descriptor of the new file by which this run holds a folder; None where a living run has it open. Raises FileNotFoundError."""
+    try:
+        file.unlink(missing_ok=True)
+        return os.open(file, os.O_CREAT | os.O_EXCL | os.O_RDWR)
+    except (PermissionError, FileExistsError):
+        return None
+
+
 def _is_of(lock: int, folder: Path) -> bool:
     """Whether the folder is the one of this descriptor, and not another one that has got its name since."""
     try:
-        return os.path.samestat(os.fstat(lock), os.stat(folder))
+        return stat.S_ISREG(os.fstat(lock).st_mode) or os.path.samestat(os.fstat(lock), os.stat(folder))
     except FileNotFoundError:
         return False
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import glob
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -12,12 +13,16 @@ from mipmap_plugin.formats.atomic import refuse_named_pipe
 
 Item = TypeVar("Item")
 
+# What a text begins with that PowerShell has written.
+UTF_16 = codecs.BOM_UTF16_LE
+
 
 def read_list(path: Path) -> list[Path]:
     """The checkpoints or patterns in a text file, one a line; what follows a # is a comment. Raises SettingsError."""
     try:
         refuse_named_pipe(path)
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        content = path.read_bytes()
+        lines = content.decode("utf-16" if content.startswith(UTF_16) else "utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise SettingsError(f"{path}: {reason}; --list takes a text file with a checkpoint on each line") from None

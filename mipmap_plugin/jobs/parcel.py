@@ -78,7 +78,7 @@ def do_parcel(parcel: Parcel, do: Callable[[Job], Outcome]) -> Delivery:
         kept = {"done": (place / OUTPUT).rglob("*"), "interrupted": _states(place / job.target)}.get(outcome.status, [])
         written = [file for file in kept if file.is_file()]
         file = outcome.file and outcome.file.relative_to(place / OUTPUT)
-        reason = outcome.reason.replace(f"{place}/", "")
+        reason = outcome.reason.replace(f"{place}{os.sep}", "")
         return Delivery(replace(outcome, job=job, file=file, reason=reason), _archive({each.relative_to(place / OUTPUT): each for each in written}))
 
 

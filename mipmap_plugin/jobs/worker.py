@@ -47,7 +47,7 @@ class Worker:
         try:
             pickle.dump((job, self.threads), stream)
             stream.flush()
-        except BrokenPipeError:
+        except OSError:  # BrokenPipeError, or another one on Windows
             raise self._death() from None
 
     def outcome(self) -> Outcome:

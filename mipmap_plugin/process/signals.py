@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-# Signals whose default is to end a process at once; Windows has one of them.
-SIGNALS = [signal.Signals[name] for name in ("SIGTERM", "SIGHUP") if name in signal.Signals.__members__]
+# Signals whose default is to end a process at once; Windows lacks SIGHUP, and alone has SIGBREAK: Ctrl-Break, or a console that is closed.
+SIGNALS = [signal.Signals[name] for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if name in signal.Signals.__members__]
 
 # Seconds in which further ones count as the same: `timeout` sends its signal to the process, and again to its group.
 SAME_S = 5.0

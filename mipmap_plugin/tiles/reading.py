@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from mipmap_plugin.errors import CheckpointError, SettingsError, plural, warn
 from mipmap_plugin.formats.atomic import sha256
+from mipmap_plugin.formats.here import typed
 from mipmap_plugin.formats.ply_rows import PlyRows
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.models import Checkpoint, detect
@@ -38,7 +38,7 @@ def find_splats(path: Path) -> tuple[Checkpoint, type[VanillaModel]]:
     if checkpoint.family in ("exchange", "gltf"):
         name, plain = checkpoint.path.name, checkpoint.path.with_name(checkpoint.path.name.split(".")[0] + "_plain.ply").name
         in_python = f"load_model({name!r}).save(Path({plain!r}), provenance={{}}) in Python"
-        how = f"splat-transform {shlex.join([name, plain])}" if checkpoint.family == "exchange" else in_python
+        how = f"splat-transform {typed([name, plain])}" if checkpoint.family == "exchange" else in_python
         raise SettingsError(f"{checkpoint.path}: only a plain PLY is cut into tiles; convert it first ({how}), or leave --tiles out")
     if kind is None or checkpoint.path.suffix.lower() != ".ply":
         raise SettingsError(

@@ -42,15 +42,12 @@ class Splats:
     @classmethod
     def of(cls, kind: type[VanillaModel], parts: Sequence[Store]) -> Splats:
         """The splats of these files, whose places are read once."""
-        places = torch.cat([_places(shapes) for part in parts for shapes in part.shapes.split(CHUNK)])
-        splats = cls(kind, parts, places)
-        splats.release()
-        return splats
+        return cls(kind, parts, torch.cat([_places(shapes) for part in parts for shapes in part.mapped()[0].split(CHUNK)]))
 
     def parameters(self, rows: Tensor, *, colored: bool = True) -> dict[str, Tensor]:
         """The raw parameters of rows [M], in their order; without colors: of SH degree 0, and gray."""
         order = rows.argsort()
-        sorted_rows, coefficients = rows[order], self.parts[0].sh.shape[1] if colored else 1
+        sorted_rows, coefficients = rows[order], self.parts[0].coefficients if colored else 1
         shapes, sh = torch.empty(len(rows), SHAPE), (torch.empty if colored else torch.zeros)(len(rows), coefficients, 3)
         for part, first, end in zip(self.parts, self.starts, self.starts[1:], strict=False):
             for start in range(first, end, CHUNK):  # so that little of a file is in memory at a time
@@ -67,11 +64,6 @@ class Splats:
         if self.opacities is not None:
             splats = replace(splats, opacities=self.opacities[rows])
         return splats
-
-    def release(self) -> None:
-        """Give the memory of what was read back to the system."""
-        for part in self.parts:
-            part.release()
 
     def seen_by(self, camera: Camera, near: float) -> tuple[Tensor, Tensor]:
         """The rows that may reach into a view, and the depth of each."""

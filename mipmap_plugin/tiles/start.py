@@ -153,8 +153,7 @@ class StartSearch:
             splats.opacities = opacities
             return painter.weighed(splats, views)[0]
 
-        opacities = torch.cat([part.shapes[:, -1] for part in splats.parts]).sigmoid()
-        splats.release()
+        opacities = torch.cat([part.mapped()[0][:, -1] for part in splats.parts]).sigmoid()
         opacities = matched_opacities(opacities, wanted, whole, weights_of)
         for number, (part, matched) in enumerate(zip(splats.parts, opacities.split([*map(len, splats.parts)]), strict=True)):
             model = self.scene.for_target(part.parameters())

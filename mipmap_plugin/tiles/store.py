@@ -29,38 +29,35 @@ PIECE = 1 << 14
 
 
 class Store:
-    """The splats of a file, mapped into memory."""
+    """The splats of a file, which is mapped into memory only while they are read: Windows neither replaces nor removes a file that is mapped."""
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         with path.open("rb") as file:
-            count, coefficients = HEADER.unpack(file.read(HEADER.size))
-            self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)  # torch wants memory that could be written to
-        shapes = count * SHAPE
-        numbers = torch.frombuffer(self._map, dtype=torch.float32, offset=HEADER.size)
-        self.shapes = numbers[:shapes].view(count, SHAPE)
-        self.sh = numbers[shapes:].view(count, coefficients, 3)
+            self._count, self.coefficients = HEADER.unpack(file.read(HEADER.size))
 
     def __len__(self) -> int:
-        return len(self.shapes)
+        return int(self._count)
+
+    def mapped(self) -> tuple[Tensor, Tensor]:
+        """Both parts of all rows, [N, 11] and [N, K, 3]. What is read of them is in memory until they go."""
+        with self._path.open("rb") as file:
+            content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)  # torch wants memory that could be written to
+        numbers = torch.frombuffer(content, dtype=torch.float32, offset=HEADER.size)
+        shapes = self._count * SHAPE
+        return numbers[:shapes].view(self._count, SHAPE), numbers[shapes:].view(self._count, self.coefficients, 3)
 
     def read(self, rows: Tensor, shapes: Tensor, sh: Tensor | None) -> None:
         """Write both parts of rows [M] to `shapes` [M, 11] and, where it is given, to `sh` [M, K, 3]."""
         if len(rows):
-            torch.index_select(self.shapes, 0, rows, out=shapes)
+            all_shapes, all_sh = self.mapped()
+            torch.index_select(all_shapes, 0, rows, out=shapes)
             if sh is not None:
-                torch.index_select(self.sh, 0, rows, out=sh)
-            self.release()
+                torch.index_select(all_sh, 0, rows, out=sh)
 
     def parameters(self) -> dict[str, Tensor]:
         """Copies of the raw parameters of all rows."""
-        shapes, sh = self.shapes.clone(), self.sh.clone()
-        self.release()
-        return as_parameters(shapes, sh)
-
-    def release(self) -> None:
-        """Give the memory of what was read back to the system; later reads find it in the system's cache, or on the disk."""
-        if hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
-            self._map.madvise(mmap.MADV_DONTNEED)
+        return as_parameters(*(part.clone() for part in self.mapped()))
 
 
 def as_parameters(shapes: Tensor, sh: Tensor) -> dict[str, Tensor]:

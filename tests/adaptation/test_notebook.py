@@ -84,7 +84,7 @@ def test_the_curve_of_an_adapted_model_is_plotted(adapted):
 
 def test_a_plot_without_matplotlib_is_one_sentence(adapted, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(SettingsError, match=r"pip install 'mipmap-plugin\[plot\]'"):
+    with pytest.raises(SettingsError, match=r'pip install "mipmap-plugin\[plot\]"'):
         adapted.plot()
 
 

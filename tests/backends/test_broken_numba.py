@@ -60,7 +60,7 @@ def test_without_numba_the_error_says_what_to_install(monkeypatch):
     g = gaussians(2, dtype=torch.float32)
     needs = Needs.of(g, Effects(1), gradients=True)
     assert cpu.CpuBackend().lacking(needs) == [cpu.NO_NUMBA]
-    with pytest.raises(BackendUnavailable, match=r"pip install 'mipmap-plugin\[cpu\]'"):
+    with pytest.raises(BackendUnavailable, match=r'pip install "mipmap-plugin\[cpu\]"'):
         cpu.CpuBackend().render(g, camera(), Effects(1))
     with pytest.warns(UserWarning, match="numba, which some .* have no wheels of; .*; the backend reference takes its place, many times slower"):
         assert choose_backend("auto", needs)[0].name == "reference"

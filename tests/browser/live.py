@@ -37,7 +37,7 @@ WINDOW = {"width": 1200, "height": 800}
 
 def missing() -> str:
     """What these tests lack here, in a sentence; empty where nothing is missing."""
-    return missing_browser() or ("" if find_spec("viser") else "viser is not installed; `pip install '.[view]'` brings it")
+    return missing_browser() or ("" if find_spec("viser") else 'viser is not installed; `pip install ".[view]"` brings it')
 
 
 def embedded(folder: Path) -> Path:

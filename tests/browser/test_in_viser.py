@@ -25,7 +25,7 @@ NEARLY_ALIKE = 40.0
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    if lacking := missing() or ("" if find_spec("viser") else "viser is not installed; `pip install '.[view]'` brings it"):
+    if lacking := missing() or ("" if find_spec("viser") else 'viser is not installed; `pip install ".[view]"` brings it'):
         pytest.skip(lacking)
     with Browser() as started:
         yield started

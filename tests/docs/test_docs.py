@@ -43,7 +43,7 @@ def test_the_readme_is_read_in_two_minutes():
 def test_set_up_is_two_commands():
     """What .ci/run and the tests of a fresh clone follow."""
     lines = [line for block in blocks(ROOT / "README.md", python=False) for line in block.splitlines()]
-    assert lines[:2] == ["pip install -c constraints.txt . && mipmap-plugin demo", "pip install -c constraints.txt '.[test]' && pytest"]
+    assert lines[:2] == ["pip install -c constraints.txt . && mipmap-plugin demo", 'pip install -c constraints.txt ".[test]" && pytest']
 
 
 def test_every_page_is_in_the_navigation():

@@ -94,5 +94,5 @@ def test_what_lacks_is_named_with_its_remedy(monkeypatch):
     with pytest.raises(SettingsError, match=r"cannot be downloaded .*no route.*; download https://.*vgg16.* and give the file \(--lpips-weights\)"):
         Perceptual("vgg")
     monkeypatch.setitem(sys.modules, "lpips", None)
-    with pytest.raises(PluginError, match=r"pip install 'mipmap-plugin\[metrics\]'"):
+    with pytest.raises(PluginError, match=r'pip install "mipmap-plugin\[metrics\]"'):
         Perceptual("alex")

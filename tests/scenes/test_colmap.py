@@ -219,5 +219,5 @@ def test_quaternions_may_have_any_norm(tmp_path):
 def test_without_pycolmap_the_extra_is_named(tmp_path, monkeypatch):
     write_text_model(tmp_path / "sparse/0", names(1))
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    with pytest.raises(SceneError, match=r"pip install 'mipmap-plugin\[colmap\]'"):
+    with pytest.raises(SceneError, match=r'pip install "mipmap-plugin\[colmap\]"'):
         load_scene(tmp_path)

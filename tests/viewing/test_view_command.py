@@ -52,7 +52,7 @@ def test_without_viser_the_command_says_what_to_install(tmp_path, monkeypatch, c
     monkeypatch.setitem(sys.modules, "viser", None)
     assert main(["view", str(tiny.ply(tmp_path / "base.ply")), "--no-browser"]) == 2
     assert capsys.readouterr().err.strip() == f"mipmap-plugin: {NO_VISER}"
-    assert "pip install 'mipmap-plugin[view]'" in NO_VISER and "pip install '.[view]'" in NO_VISER
+    assert 'pip install "mipmap-plugin[view]"' in NO_VISER and 'pip install ".[view]"' in NO_VISER
 
 
 def test_a_viewer_is_listed_once_under_the_name_that_was_asked_for(base):

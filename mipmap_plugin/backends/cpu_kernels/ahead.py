@@ -45,7 +45,7 @@ def _start(has_covariances: bool, effects: Effects, merging: bool) -> subprocess
         return None
     process = subprocess.Popen([sys.executable, "-c", COMMAND], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     assert process.stdin is not None
-    with suppress(BrokenPipeError), process.stdin as pipe:  # it has failed already
+    with suppress(OSError), process.stdin as pipe:  # it has failed already
         pipe.write(pickle.dumps((has_covariances, effects, merging)))
     return process
 

@@ -104,7 +104,7 @@ def test_a_file_that_is_not_there_and_a_name_that_nobody_registered():
 def test_without_spandrel_the_remedy_is_named(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "spandrel", None)
     torch.save({}, tmp_path / "net.pth")
-    with pytest.raises(PluginError, match=r"pip install 'mipmap-plugin\[sr\]'"):
+    with pytest.raises(PluginError, match=r'pip install "mipmap-plugin\[sr\]"'):
         Network(tmp_path / "net.pth")
 
 

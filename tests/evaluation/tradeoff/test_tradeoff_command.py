@@ -51,7 +51,7 @@ def test_wrong_options_are_refused_before_anything_is_measured(tmp_path, capsys,
 def test_pictures_without_matplotlib_are_refused_before_anything_is_measured(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     assert command(tmp_path, "--picture") == 2
-    assert "pip install 'mipmap-plugin[plot]'" in capsys.readouterr().err
+    assert 'pip install "mipmap-plugin[plot]"' in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 
