@@ -11,7 +11,7 @@ import pytest
 import tiny
 import torch
 from anchor_checkpoints import Layout
-from tiny import with_bands
+from tiny import with_bands, wrapped
 
 from mipmap_plugin import cli
 from mipmap_plugin.adaptation.report import Report
@@ -24,10 +24,6 @@ from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.render_settings import EvenBuckets, Packing, RenderSettings
 from mipmap_plugin.wrap import wrap_model
-
-
-def wrapped(splats, **trained):
-    return wrap_model(VanillaModel.from_gaussians(splats, TrainedScale(**trained)), cameras=tiny.cameras(1), backend="reference")
 
 
 def states(effects: Effects, splats: Gaussians) -> dict:

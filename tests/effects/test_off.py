@@ -8,7 +8,7 @@ import moving
 import pytest
 import tiny
 import torch
-from tiny import with_bands
+from tiny import with_bands, wrapped
 
 from mipmap_plugin import register_upsampler
 from mipmap_plugin.adaptation.optimization import density
@@ -17,20 +17,14 @@ from mipmap_plugin.backends import reference, supersample
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import PluginError
-from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.moving.deformable import DeformNetwork
 from mipmap_plugin.models.moving.hexplane import HexPlane
-from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting import filters, harmonics
 from mipmap_plugin.wrap import wrap_model
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
 BRIEF = dict(steps=2, extra_views=0)
-
-
-def wrapped(splats, **trained):
-    return wrap_model(VanillaModel.from_gaussians(splats, TrainedScale(**trained)), cameras=tiny.cameras(1), backend="reference")
 
 
 def counted(monkeypatch, owner, name) -> list:

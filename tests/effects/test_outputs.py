@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from tiny import wrapped
 
 from mipmap_plugin import cli
 from mipmap_plugin.backends import geometry, get_backend
@@ -16,8 +17,6 @@ from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting.rotations import rotations
 from mipmap_plugin.wrap import wrap_model
 
@@ -30,10 +29,6 @@ def backend(request):
     if request.param == "cpu":
         pytest.importorskip("numba")
     return request.param
-
-
-def wrapped(splats: Gaussians, backend: str = "reference", **trained):
-    return wrap_model(VanillaModel.from_gaussians(splats, TrainedScale(**trained)), cameras=tiny.cameras(1), backend=backend)
 
 
 def view():

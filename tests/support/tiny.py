@@ -15,6 +15,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import orbit, write_cameras
+from mipmap_plugin.wrap import Wrapped, wrap_model
 
 WIDTH, HEIGHT = 32, 24  # px
 
@@ -38,6 +39,11 @@ def with_bands(used: int, room: int) -> Gaussians:
 
 def model(count: int = 60, trained: TrainedScale = TrainedScale(), **options) -> VanillaModel:  # noqa: B008
     return VanillaModel.from_gaussians(gaussians(count, **options), trained)
+
+
+def wrapped(splats: Gaussians, backend: str = "reference", **trained) -> Wrapped:
+    """Plain 3DGS of `splats`, with one camera; `trained`: of `TrainedScale`."""
+    return wrap_model(VanillaModel.from_gaussians(splats, TrainedScale(**trained)), cameras=cameras(1), backend=backend)
 
 
 def cameras(count: int = 4, seed: int = 1, split: str = "train", width: int = WIDTH, height: int = HEIGHT) -> list[Camera]:
