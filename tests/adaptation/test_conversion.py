@@ -11,7 +11,7 @@ import tiny
 from mipmap_plugin.adaptation.conversion import conversion
 from mipmap_plugin.adaptation.optimization.budget import Pace
 from mipmap_plugin.adaptation.session import Session
-from mipmap_plugin.adaptation.start import base_weights
+from mipmap_plugin.adaptation.start import base_weights, candidates
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
@@ -69,11 +69,12 @@ def test_a_zoom_in_starts_from_it_and_tells_so():
     assert report.curve[0].seconds > report.seconds["conversion"]
 
 
-def test_a_zoom_in_starts_without_it_where_that_is_better():
+@pytest.mark.parametrize("budget", [None, 600.0], ids=["all steps", "in a time budget"])
+def test_a_zoom_in_starts_without_it_where_that_is_better(budget):
     """At x1 the classic filter is wider than that of this base, which is wider than the classic one of x2."""
     base = wrap_model(tiny.model(60, TrainedScale("mip", 0.1)), cameras=tiny.cameras(8), backend="cpu", threads=1)
-    validation = base.adapt(2, viewer="classic", **BRIEF).report.validation
-    direct = base.adapt(2, viewer="classic", **BRIEF, conversion_steps=0).report.validation
+    validation = base.adapt(2, viewer="classic", time_budget_s=budget, **BRIEF).report.validation
+    direct = base.adapt(2, viewer="classic", time_budget_s=budget, **BRIEF, conversion_steps=0).report.validation
     assert validation["the start, the closed form without the conversion"] == direct["the start, the closed form"]
 
 
@@ -164,6 +165,13 @@ def test_a_time_budget_is_for_both_and_told_as_it_was_given(monkeypatch):
     monkeypatch.setattr(Session, "run", lambda self, *given: budgets.append(self.config.time_budget_s) or run(self, *given))
     report = wrapped().adapt(2, viewer="antialiased", time_budget_s=60.0, **BRIEF).report
     assert budgets == [30.0, 30.0] and report.settings.time_budget_s == 60.0 and report.ended_by == "3 steps"
+
+
+def test_the_starts_with_and_without_it_share_the_time_of_one(monkeypatch):
+    seconds, clock = [], candidates.Clock
+    monkeypatch.setattr(candidates, "Clock", lambda some, device: seconds.append(some) or clock(some, device))
+    wrapped().adapt(2, viewer="antialiased", time_budget_s=80.0, **BRIEF)
+    assert seconds == [20.0, 10.0, 10.0]  # of the conversion, and of the zoom-in after it and without it
 
 
 def test_a_budget_that_both_stages_start_takes_is_told_whole_and_once():

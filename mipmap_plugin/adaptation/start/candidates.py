@@ -46,7 +46,8 @@ COARSE_POWERS, LEAST_DB = (1, 7 / 8, 3 / 4, 5 / 8, 1 / 2), 25.0
 # dB by which such a result may be worse than the base itself: steps regain 3 to 8 dB.
 COARSE_COSTS = 3.0
 
-# The fraction of a time budget that the start may take. Candidates that would not be finished in it are left out.
+# The fraction of a time budget that the start may take, both of them together where there are two. Candidates that would not be finished in it are
+# left out.
 START_SHARE = 0.5
 
 # In a time budget that is too short for a search, a run begins with the strongest merging if that is to leave at most FAR_FEWER of the splats, which
@@ -88,10 +89,10 @@ def best_start(problems: Sequence[StartProblem]) -> tuple[SplatModel, str, list[
 
     At x1 a viewer's filter may be wider than the base's, which takes from thin splats what a zoom-in, where that filter is narrower, needs.
     """
-    found = [(*search.best(), search.notes) for search in map(StartSearch, problems)]  # none keeps its memory during the next
-    start, name, _ = max(found, key=lambda each: problems[0].quality(each[0]).visible) if len(found) > 1 else found[0]
-    told = f"{name} without the conversion" if start is not found[0][0] else name
-    return start, told, [note for *_, notes in found for note in notes]
+    searches = (StartSearch(problem, START_SHARE / len(problems)) for problem in problems)
+    found = [(*search.best(), search.notes) for search in searches]  # none keeps its memory during the next
+    start, name, notes = max(found, key=lambda each: problems[0].quality(each[0]).visible) if len(found) > 1 else found[0]
+    return start, f"{name} without the conversion" if start is not found[0][0] else name, notes
 
 
 def mildest_costs(config: AdaptConfig, base: Effects, target: Effects) -> float:
@@ -103,11 +104,11 @@ def mildest_costs(config: AdaptConfig, base: Effects, target: Effects) -> float:
 class StartSearch:
     """The candidates, and the choice among them by their PSNR on the steering views."""
 
-    def __init__(self, problem: StartProblem) -> None:
+    def __init__(self, problem: StartProblem, share: float = START_SHARE) -> None:
         self._problem, self._rounds = problem, Rounds()
         self._least, self._crispness = 0.0, problem.config.crispness  # the fraction of the rows that stay, of a zoom-in how crisp it is
         budget, device = problem.config.time_budget_s, problem.base().parameters()["means"].device
-        self._clock = Clock(START_SHARE * budget if budget else math.inf, device)
+        self._clock = Clock(share * budget if budget else math.inf, device)
         self._seen = BaseWeights(problem, self._clock)
         self.notes = self._seen.notes
         self._alike = draws_alike(problem.base_effects, problem.target)
