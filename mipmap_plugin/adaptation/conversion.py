@@ -7,6 +7,7 @@ without and 32 with it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -85,7 +86,8 @@ class Stages:
         stopped = session.ended is End.OBSERVER
         del session  # with the truths of its views
         half = config.model_copy(update={"time_budget_s": _half(config)} | ({"steps": 0} if stopped else {}))
-        request = replace(self.request, finer=FinerLevel(converted.model, 1.0, NAME, converts=True), budget_share=SHARE)
+        finer = FinerLevel(converted.model, 1.0, NAME, converts=True, learned=learned(converted.report))
+        request = replace(self.request, finer=finer, budget_share=SHARE)
         with _kept_if_interrupted(converted.states):
             adapted = Session(request, scale, half, cameras, self.photographs).run(self.resume, self._further(converted.report))
         settings = {"time_budget_s": config.time_budget_s} | ({"steps": config.steps} if stopped else {})
@@ -114,6 +116,12 @@ def _kept_if_interrupted(states: Sequence[StateFile]) -> Iterator[None]:
         for state in states:
             state.remove()
         raise
+
+
+def learned(report: Report) -> bool:
+    """Whether steps of a conversion have more dB than the base and the start, from which they were taken."""
+    base_and_start = list(report.validation.values())[:2]
+    return (report.psnr_after() or 0.0) > max(base_and_start, default=math.inf)
 
 
 def _half(config: AdaptConfig) -> float | None:

@@ -149,7 +149,9 @@ class Session:
         if (finer := self.finer) is None:
             return [from_base]
         from_level = from_base.from_level(finer, lambda: self._for_target(finer.model, shared=True))
-        return [from_level, from_base] if finer.converts else [from_level]
+        if not finer.converts:
+            return [from_level]
+        return [from_level, from_base] if finer.learned else [from_base, from_level]
 
     def _select(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str) -> Adapted:
         """Return the best of the states on views that did not steer the run, or the last where the settings say so."""

@@ -38,8 +38,8 @@ class StartSearch:
     def __init__(self, scene: TiledScene) -> None:
         self.scene, self.truths = scene, Truths(scene)
         effects = scene.base_effects, scene.target
-        keeps = draws_alike(*effects) and scene.config.steps > 0  # as without tiles
-        self.forms = scene.config.closed_form and not (keeps or filter_suffices(*effects))
+        self.alike = draws_alike(*effects)
+        self.forms = scene.config.closed_form and not filter_suffices(*effects)
         self.views: list[Camera] = []  # those in which blend weights are measured, which `_measured` finds
 
     @torch.no_grad()
@@ -52,6 +52,8 @@ class StartSearch:
         pool.release_to_system()
         self._candidate("formed", weights, 1.0)
         formed_db = self.steer(self._open("formed"))
+        if self.alike and formed_db < base_db:  # the filter itself is the better answer, for merged splats too, as without tiles
+            self.forms, formed_db = False, base_db
         if config.merge_to < 1 and self._takes_merged(weights, formed_db, base_db):
             return
         if formed_db < base_db or not self.forms:

@@ -8,10 +8,12 @@ from dataclasses import replace
 import pytest
 import tiny
 
-from mipmap_plugin.adaptation.conversion import conversion
+from mipmap_plugin.adaptation.conversion import conversion, learned
 from mipmap_plugin.adaptation.optimization.budget import Pace
+from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.session import Session
-from mipmap_plugin.adaptation.start import base_weights, candidates
+from mipmap_plugin.adaptation.start import base_weights
+from mipmap_plugin.adaptation.start.clock import Clock
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
@@ -167,11 +169,22 @@ def test_a_time_budget_is_for_both_and_told_as_it_was_given(monkeypatch):
     assert budgets == [30.0, 30.0] and report.settings.time_budget_s == 60.0 and report.ended_by == "3 steps"
 
 
-def test_the_starts_with_and_without_it_share_the_time_of_one(monkeypatch):
-    seconds, clock = [], candidates.Clock
-    monkeypatch.setattr(candidates, "Clock", lambda some, device: seconds.append(some) or clock(some, device))
-    wrapped().adapt(2, viewer="antialiased", time_budget_s=80.0, **BRIEF)
-    assert seconds == [20.0, 10.0, 10.0]  # of the conversion, and of the zoom-in after it and without it
+@pytest.mark.parametrize("learned", [True, False])
+def test_a_budget_with_time_for_one_start_tries_the_more_promising_one(monkeypatch, learned):
+    """The conversion is that if its steps have bettered it."""
+    monkeypatch.setattr(Clock, "allows", lambda clock, work, *_: work != "start")
+    monkeypatch.setattr("mipmap_plugin.adaptation.conversion.learned", lambda _: learned)
+    report = wrapped().adapt(2, viewer="antialiased", time_budget_s=600.0, **BRIEF).report
+    [start] = [state for state in report.validation if state.startswith("the start")]
+    assert ("without the conversion" in start) != learned
+
+
+@pytest.mark.parametrize(("after", "learns"), [(31.0, True), (30.0, False), (29.0, False)])
+def test_a_conversion_has_learned_if_its_steps_beat_base_and_start(after, learns):
+    report = wrapped().adapt(1, viewer="antialiased", recipe="instant").report
+    validation = {AS_IT_IS: 20.0, "the start, the closed form": 30.0, "the last state": after}
+    assert learned(report.model_copy(update={"validation": validation, "returned": "the last state"})) == learns
+    assert not learned(report.model_copy(update={"validation": {}}))
 
 
 def test_a_budget_that_both_stages_start_takes_is_told_whole_and_once():

@@ -53,12 +53,20 @@ def test_the_mildest_merging_may_cost_more_before_steps_for_another_renderer(job
     assert torch.load(scene.folder / "start.pt")["name"] == name and not list(measured)
 
 
-@pytest.mark.parametrize(("steps", "name"), [(0, "the closed form"), (4, "the base as it is")])
-def test_a_base_that_compensates_has_a_closed_form_where_no_step_follows(job, monkeypatch, steps, name):
-    """As without tiles: lego_100, converted to such a base, has 32.1 dB in place of 29.4 at x1/2."""
+@pytest.mark.parametrize(
+    ("formed_db", "settings", "name"),
+    [
+        (31.0, {"steps": 0}, "the closed form"),
+        (31.0, {"steps": 4}, "the closed form"),
+        (29.0, {"steps": 4}, "the base as it is"),
+        (29.0, {"steps": 4, "merge_to": 0.5}, "merged splats"),
+    ],
+)
+def test_a_base_that_compensates_has_a_closed_form_where_that_is_better(job, monkeypatch, formed_db, settings, name):
+    """As without tiles: the base as it is has 30 dB, and what is merged too."""
     folder = tiny.folder(job.base.checkpoint.with_name("compensated"), tiny.cameras(3, width=20, height=16), trained=TrainedScale("antialiased", 0.3))
-    scene = cut_in_three(replace(job, base=Base(folder)), steps=steps)
-    measured = iter((30.0, 31.0))
+    scene = cut_in_three(replace(job, base=Base(folder)), **settings)
+    measured = iter((30.0, formed_db, 30.0, 30.0))
     monkeypatch.setattr("mipmap_plugin.tiles.start.psnr", lambda *_: next(measured))
     StartSearch(scene).run()
     assert torch.load(scene.folder / "start.pt")["name"] == name

@@ -15,7 +15,7 @@ from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.pixel_size import mean_pixel_size
 from mipmap_plugin.adaptation.start.base_weights import BaseWeights
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
-from mipmap_plugin.adaptation.start.clock import Clock
+from mipmap_plugin.adaptation.start.clock import start_clock
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import ROUNDS, matched_opacities
 from mipmap_plugin.adaptation.start.merging import Rounds, merge_down, merge_seen
@@ -45,10 +45,6 @@ COARSE_POWERS, LEAST_DB = (1, 7 / 8, 3 / 4, 5 / 8, 1 / 2), 25.0
 
 # dB by which such a result may be worse than the base itself: steps regain 3 to 8 dB.
 COARSE_COSTS = 3.0
-
-# The fraction of a time budget that the start may take, both of them together where there are two. Candidates that would not be finished in it are
-# left out.
-START_SHARE = 0.5
 
 # In a time budget that is too short for a search, a run begins with the strongest merging if that is to leave at most FAR_FEWER of the splats, which
 # makes steps much faster, and really leaves at most REACHED times as many as it is to. Lego and chair keep up to 1.3 times as many, and gain 0.6 to
@@ -85,14 +81,20 @@ UNMATCHED = "the time budget left no time to fit opacities to what splats show i
 
 @torch.no_grad()
 def best_start(problems: Sequence[StartProblem]) -> tuple[SplatModel, str, list[str]]:
-    """The best start, what it is called in the report, and what is to be said of it. `problems`: a second one is without the conversion of the first.
+    """The best start, what it is called in the report, and what is to be said of it. `problems`: of two, one is without the conversion.
 
     At x1 a viewer's filter may be wider than the base's, which takes from thin splats what a zoom-in, where that filter is narrower, needs.
+    In a time budget the second one is tried if there is time for another start like the first.
     """
-    searches = (StartSearch(problem, START_SHARE / len(problems)) for problem in problems)
-    found = [(*search.best(), search.notes) for search in searches]  # none keeps its memory during the next
-    start, name, notes = max(found, key=lambda each: problems[0].quality(each[0]).visible) if len(found) > 1 else found[0]
-    return start, f"{name} without the conversion" if start is not found[0][0] else name, notes
+    clock, found = start_clock(problems[0]), list[tuple[SplatModel, str, list[str]]]()
+    for problem in problems:
+        if not found or clock.allows("start"):
+            with clock.timing("start"):
+                search = StartSearch(problem)
+                start, name = search.best()
+            found.append((start, name if len(problems) == 1 or problem.coarse_base else f"{name} without the conversion", search.notes))
+            del search  # which keeps memory
+    return max(found, key=lambda each: problems[0].quality(each[0]).visible) if len(found) > 1 else found[0]
 
 
 def mildest_costs(config: AdaptConfig, base: Effects, target: Effects) -> float:
@@ -104,21 +106,18 @@ def mildest_costs(config: AdaptConfig, base: Effects, target: Effects) -> float:
 class StartSearch:
     """The candidates, and the choice among them by their PSNR on the steering views."""
 
-    def __init__(self, problem: StartProblem, share: float = START_SHARE) -> None:
+    def __init__(self, problem: StartProblem) -> None:
         self._problem, self._rounds = problem, Rounds()
         self._least, self._crispness = 0.0, problem.config.crispness  # the fraction of the rows that stay, of a zoom-in how crisp it is
-        budget, device = problem.config.time_budget_s, problem.base().parameters()["means"].device
-        self._clock = Clock(share * budget if budget else math.inf, device)
+        self._clock = start_clock(problem)
         self._seen = BaseWeights(problem, self._clock)
         self.notes = self._seen.notes
         self._alike = draws_alike(problem.base_effects, problem.target)
-        # The steps of a zoom-out end 0.2 dB higher from the base's own shapes (lego and chair, x1/4).
-        keeps = self._alike and problem.config.steps > 0 and problem.scale <= 1
         self._more_costs = mildest_costs(problem.config, problem.base_effects, problem.target) - problem.config.merging_costs
-        unchanged = keeps or filter_suffices(problem.base_effects, problem.target)
-        self._forms = problem.config.closed_form and not keeps
+        self._forms = problem.config.closed_form
         spreads = problem.target.screen_filter == SURFEL or problem.target.screen_filter in INTEGRATED  # otherwise than by a variance in px²
-        self._matches_weights = problem.has_blend_weights and not unchanged and (problem.scale <= 1 or not spreads)
+        suffices = filter_suffices(problem.base_effects, problem.target)
+        self._matches_weights = problem.has_blend_weights and not suffices and (problem.scale <= 1 or not spreads)
 
     @torch.no_grad()
     def best(self) -> tuple[SplatModel, str]:

@@ -8,8 +8,12 @@ from contextlib import contextmanager
 
 import torch
 
+from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.process.clock import now
+
+# The fraction of a time budget that the start may take. Candidates that would not be finished in it are left out.
+START_SHARE = 0.5
 
 # px, the geometric mean of a view's sides: views are not made smaller than this to weigh splats in them, which takes a twentieth of a second.
 LEAST_SIDE = 1000
@@ -53,3 +57,9 @@ class Clock:
 
     def _spent(self) -> float:
         return now(self._device) - self._began
+
+
+def start_clock(problem: StartProblem) -> Clock:
+    """The clock of a search for a start: without a time budget it is not limited."""
+    budget = problem.config.time_budget_s
+    return Clock(START_SHARE * budget if budget else math.inf, problem.base().parameters()["means"].device)

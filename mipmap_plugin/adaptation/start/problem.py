@@ -22,6 +22,7 @@ class FinerLevel:
     scale: float
     name: str = "the finer level"  # what it is called in the report
     converts: bool = False  # it is the conversion at x1 before a zoom-in; what its views show of the base was told when it was made
+    learned: bool = True  # steps have bettered it: in a time budget that has no time for two starts, it is worth more than the base
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,7 +43,7 @@ def test_the_closed_form_helps_in_the_bases_own_renderer_too(scale):
         assert psnr(new, truth) > psnr(old, truth)
 
 
-@pytest.mark.parametrize(("formed_db", "steps", "forms"), [(31.0, 0, True), (29.0, 0, False), (31.0, 9, False)])
+@pytest.mark.parametrize(("formed_db", "steps", "forms"), [(31.0, 0, True), (29.0, 0, False), (31.0, 9, True), (29.0, 9, False)])
 def test_merged_splats_keep_their_shapes_where_the_filter_alone_is_better(monkeypatch, formed_db, steps, forms):
     """The base as it is has 30 dB."""
     reshaped = []

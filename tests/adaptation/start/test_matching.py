@@ -6,9 +6,9 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.start import candidates
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.candidates import UNMATCHED
+from mipmap_plugin.adaptation.start.clock import Clock
 from mipmap_plugin.adaptation.start.matching import MAX_FACTOR, ROUNDS, matched_opacities
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
@@ -88,7 +88,7 @@ def test_a_budget_that_ends_before_opacities_are_matched_says_so(monkeypatch, vi
     base = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
     steps = {"steps": 2, "extra_views": 2, "viewer": viewer, "merge_to": 1.0}
     whole = base.adapt(4, **steps).report
-    monkeypatch.setattr(candidates.Clock, "allows", lambda *_: False)
+    monkeypatch.setattr(Clock, "allows", lambda *_: False)
     short = base.adapt(4, **steps, time_budget_s=60.0).report
     assert UNMATCHED in short.notes and UNMATCHED not in whole.notes
     assert short.psnr_after() >= short.psnr_before()
