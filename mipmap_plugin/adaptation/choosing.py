@@ -44,6 +44,6 @@ def mergeable_settings(model: SplatModel, settings: dict[str, Any]) -> dict[str,
         return settings
     settings = settings if traits.thins else {"merge_to": 1.0, **settings}
     if settings.get("most_splats") or (not traits.thins and settings["merge_to"] < 1):
-        reason = "its splats differ by view or time, or have a 3D filter, so none are merged"
+        reason = "its splats differ by view or time, so none are merged"
         raise SettingsError(f"{model.family}: {reason}; leave {'' if traits.thins else 'merge_to and '}most_splats (--splats, --bytes) out")
     return settings

@@ -43,12 +43,9 @@ NOTES = {
 FILTER_VARIANCE = 0.2
 FRAME_MARGIN = 0.15  # of the width and the height
 
-# No splat can be thinner than its filter; one that should be gets this fraction of it as raw scale, so that its logarithm is finite.
-THINNEST_SHARE = 0.1
-
 
 class MipModel:
-    """Splats of 3DGS, each smoothed by its own 3D filter.
+    """Splats of 3DGS, each smoothed by its own 3D filter; into new shapes that is baked, and it is 0.
 
     Parameters: those of `VanillaModel`, and the filters [N] in world units, which are never optimized.
     """
@@ -79,7 +76,7 @@ class MipModel:
         elif not self.filter_3d.any():
             on, reason = False, "the file gives one, but it is 0 for every splat"
         effect = Effect("3D filter", on, reason, "three roots a splat")
-        return Traits(filtered=True, exposures=self.splats.traits.exposures, effects=(effect,))
+        return Traits(same_for_all_views=True, filtered=True, exposures=self.splats.traits.exposures, effects=(effect,))
 
     def gaussians(self, camera: Camera | None = None) -> Gaussians:
         """All splats, activated and smoothed. `camera` is ignored."""
@@ -107,11 +104,19 @@ class MipModel:
         self.filter_3d = parameters[CARRIED]
 
     def reshape(self, form: Callable[[Gaussians], tuple[Tensor, Tensor]], views: Sequence[Camera] = ()) -> None:
-        """Give the smoothed splats the scales [N, 3] and opacities [N] that `form` returns, as far as the filter allows."""
+        """Give the smoothed splats the scales [N, 3] and opacities [N] that `form` returns. Their filter is 0 then, for they may be thinner."""
         scales, opacities = form(self.gaussians().detach())
-        if self._smooths:
-            scales, opacities = sharpen_3d(scales, opacities, self.filter_3d.detach())
         self.splats.reshape(lambda _: (scales, opacities))
+        if self._smooths:
+            self.filter_3d = torch.zeros_like(self.filter_3d).requires_grad_()
+
+    def rebuild(self, form: Callable[[Gaussians], Gaussians]) -> None:
+        """Replace the smoothed splats by those that `form` returns for them, of any number, whose filters are 0."""
+        before = self.gaussians().detach()
+        after = form(before)
+        if after is not before:
+            self.splats.rebuild(lambda _: after)
+            self.filter_3d = torch.zeros_like(after.opacities).requires_grad_()
 
     def row_opacities(self, views: Sequence[Camera] = ()) -> Tensor:
         return self.gaussians().opacities.detach()
@@ -206,14 +211,6 @@ def smooth_3d(scales: Tensor, opacities: Tensor, filter_3d: Tensor) -> tuple[Ten
     scales = scales.clamp_min(torch.finfo(scales.dtype).tiny)  # the root's gradient at 0² + 0² is infinite
     smoothed = torch.hypot(scales, filter_3d[:, None])
     return smoothed, opacities * (scales / smoothed).prod(dim=1)
-
-
-def sharpen_3d(scales: Tensor, opacities: Tensor, filter_3d: Tensor) -> tuple[Tensor, Tensor]:
-    """The inverse of `smooth_3d`; exact for scales above the filter and resulting opacities up to 1, else the nearest possible."""
-    filters = filter_3d[:, None]
-    sharp = ((scales - filters).clamp_min(0) * (scales + filters)).sqrt().maximum(THINNEST_SHARE * filters)
-    compensation = smooth_3d(sharp, torch.ones_like(opacities), filter_3d)[1]
-    return sharp, (opacities / compensation).clamp_max(1)
 
 
 def filter_3d_of(means: Tensor, cameras: Sequence[Camera]) -> Tensor:

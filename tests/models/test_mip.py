@@ -23,7 +23,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import CARRIED, TrainedScale
 from mipmap_plugin.models.health import LARGEST
-from mipmap_plugin.models.mip import MipModel, filter_3d_of, sharpen_3d, smooth_3d
+from mipmap_plugin.models.mip import MipModel, filter_3d_of, smooth_3d
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
 
@@ -73,13 +73,22 @@ def test_smoothing_has_a_finite_gradient_everywhere():
         assert torch.isfinite(smoothed).all() and torch.isfinite(opacities).all() and torch.isfinite(gradient).all()
 
 
-def test_sharpening_undoes_smoothing():
-    rng = torch.Generator().manual_seed(0)
-    scales, opacities, ball = (torch.rand(50, *shape, generator=rng) / 5 for shape in ((3,), (), ()))
-    scales += 0.2 * ball[:, None]
-    back = sharpen_3d(*smooth_3d(scales, opacities, ball), ball)
-    torch.testing.assert_close(back[0], scales, rtol=1e-3, atol=1e-5)
-    torch.testing.assert_close(back[1], opacities, rtol=1e-3, atol=1e-5)
+@pytest.mark.parametrize("family", ["mip", "gof"])
+def test_splats_may_become_thinner_than_their_filter(family):
+    """A zoom-out of Mip-Splatting had no closed form: it asks for thinner splats than the filter let through."""
+    model = ball(family).copy()
+    model.reshape(lambda splats: (splats.scales / 10, splats.opacities / 2))
+    before, after = ball(family).gaussians(), model.gaussians()
+    torch.testing.assert_close(after.scales, before.scales / 10)
+    torch.testing.assert_close(after.opacities, before.opacities / 2)
+
+
+def test_splats_with_a_filter_are_merged_as_they_look():
+    model = ball().copy()
+    model.rebuild(lambda splats: splats[:7])
+    for name in ("means", "scales", "opacities"):
+        torch.testing.assert_close(getattr(model.gaussians(), name), getattr(ball().gaussians(), name)[:7])
+    assert model.filter_3d.tolist() == [0.0] * 7
 
 
 @pytest.mark.parametrize("family", FILTERS)
@@ -135,7 +144,7 @@ def quality(model, base, scale):
 
 def test_the_filters_go_with_their_rows_and_do_not_move():
     base = ball()
-    pruning = dict(steps=12, extra_views=0, prune_every=5, min_opacity=0.3, returns="last")
+    pruning = dict(steps=12, extra_views=0, closed_form=False, merge_to=1.0, prune_every=5, min_opacity=0.3, returns="last")
     adapted = wrap_model(base, cameras=tiny.cameras()).adapt(0.25, **pruning)
     left = adapted.model.parameters()[CARRIED].detach()
     assert 0 < len(left) < len(base)

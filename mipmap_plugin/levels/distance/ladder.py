@@ -74,13 +74,13 @@ def by_distance(base: FrozenBase, request: LadderRequest) -> bool:
     if request.least_db is not None or request.until_splats is not None:
         return False
     effects, means = base.effects(), base.model.parameters()["means"].detach()
-    mergeable = base.model.traits.same_for_all_views and effects.screen_filter not in INTEGRATED
+    mergeable = base.model.traits.same_for_all_views and not base.model.traits.filtered and effects.screen_filter not in INTEGRATED
     return mergeable and own_name(request.viewer) in STREAMING and is_unbounded(means, base.views(), effects.near_plane)
 
 
 def refuse(base: FrozenBase, request: LadderRequest) -> None:
     """Raise SettingsError for what levels by distance do not support."""
-    if not base.model.traits.same_for_all_views:
+    if base.model.traits.filtered or not base.model.traits.same_for_all_views:
         raise SettingsError(f"{base.model.family}: its splats have a 3D filter, so that levels by distance cannot mix them; give by zoom")
     if (trained_with := base.effects().screen_filter) in INTEGRATED:
         raise SettingsError(f"levels by distance need a base with a dilation; this one was trained with {trained_with}; give by zoom")

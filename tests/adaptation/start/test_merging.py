@@ -3,7 +3,7 @@
 import math
 from dataclasses import replace
 
-import mip_checkpoints
+import moving
 import pytest
 import torch
 from tiny import cameras
@@ -168,7 +168,7 @@ def test_adapting_merges_and_reports_it():
 
 
 def test_a_family_whose_splats_are_not_its_rows_says_so(tmp_path):
-    base = wrap_model(mip_checkpoints.folder(tmp_path / "mip"), cameras=cameras())
+    base = wrap_model(moving.write_deformable(tmp_path / "moving"), cameras=cameras())
     assert base.adapt(1 / 4, steps=1, views="given").report.settings.merge_to == 1
     with pytest.raises(SettingsError, match=r"none are merged; leave merge_to and most_splats \(--splats, --bytes\) out"):
         base.adapt(1 / 4, merge_to=0.5)
