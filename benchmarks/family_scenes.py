@@ -89,7 +89,7 @@ FAMILIES = {
         "Deformable-3D-Gaussians", "needs its folder; the field stays frozen", lambda folder: moving.write_deformable(folder, count=SPLATS), True
     ),
     "4dgs": Family("4DGaussians", "`empty_voxel` and `grid_pe` are refused", lambda folder: moving.write_hexplane(folder, count=SPLATS), True),
-    "mip": Family("Mip-Splatting", "keeps its own filter, for its own viewer; `--viewer` makes a file for another", _filtered("mip")),
+    "mip": Family("Mip-Splatting", "a file for its own viewer (`filter_3D` is 0 where shapes are new); `--viewer` for another", _filtered("mip")),
     "gof": Family("GOF", "drawn as EWA splats, an approximation", _filtered("gof")),
     "analytic": Family("Analytic-Splatting", "as Mip-Splatting", _filtered("analytic")),
     "gsplat": Family("gsplat `ckpt_*.pt`", "cameras from its COLMAP scene (`--cameras`)", _gsplat("false")),
