@@ -7,7 +7,7 @@ import operator
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from importlib.metadata import Distribution, EntryPoint, distributions, entry_points
 from typing import Any
@@ -86,8 +86,9 @@ def unreadable_package() -> str:
 
 def _told(package: Distribution) -> str:
     """The name and the version of an installed package; of one without METADATA, as a broken installation leaves, its folder."""
-    if package.metadata:
-        return f"{package.metadata['Name']} {package.version}"
+    with suppress(FileNotFoundError):  # which importlib_metadata raises in place of the metadata, where it is imported
+        if package.metadata:
+            return f"{package.metadata['Name']} {package.version}"
     return str(getattr(package, "_path", package.locate_file("")))
 
 
