@@ -32,7 +32,9 @@ INTRO = """# Real bases against real test images
 Made by `python benchmarks/real_bases.py DATA`. Protocol P3, mean of 25 test views; seconds on one thread of a shared machine.
 
 lego_400 and those after it were trained by gsplat in 7,000 steps, on the 100 training images of lego at 400 px (`gpu_bases.py`): with the filter of
-3DGS, with gsplat's `antialiased`, and as Mip-Splatting. Their seconds are of a machine that was busy and half as fast. Not by this command:
+3DGS, with gsplat's `antialiased`, and as Mip-Splatting. Their seconds are of a machine that was busy and half as fast. The last two are
+of an earlier version, which did not begin with the closed form, and kept Mip-Splatting's 3D filter, so that nothing was merged there. Not by this
+command:
 
 - lego_400_P1: `mipmap-plugin evaluate lego_400 --images lego --protocol P1 --scale 1/2 --scale 1/4 --scale 1/8 --recipe default`.
 - lego_400_P1_area: the same at x1/4 and x1/8 with `--resize area`: adapted to box averages.
