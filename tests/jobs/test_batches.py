@@ -206,6 +206,12 @@ def test_a_list_may_come_from_a_pipe_of_the_shell_but_not_from_one_that_nobody_m
         assert read_list(Path(f"/dev/fd/{reading}")) == [Path("a.ply")]
 
 
+def test_a_list_that_is_a_link_to_itself(tmp_path):
+    (tmp_path / "list").symlink_to("list")
+    with pytest.raises(SettingsError, match="list: Too many levels of symbolic links; --list takes a text file"):
+        read_list(tmp_path / "list")
+
+
 def test_files_that_adaptations_leave_are_left_out(tmp_path):
     job = job_of(tmp_path)
     run_job(job)
