@@ -19,7 +19,7 @@ from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError, plural, warn
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, settled, together, write_json
 from mipmap_plugin.jobs.base import Base
-from mipmap_plugin.progress import counted
+from mipmap_plugin.progress import counted, note
 from mipmap_plugin.screen_filters import Name
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def render(
     left = [(view, to) for view, to in zip(views, pictures, strict=True) if finished.get(to.name) != request or not to.is_file()]
     _refuse(wrapped, [picture for _, picture in left], outputs, overwrite)
     _check(wrapped, views, exposure)
-    with _kept(output, request):
+    with _kept(output, request, len(views) - len(left)):
         for camera, picture in counted(left, len(left), "rendering", "view"):
             _write(picture, wrapped.render(camera.zoomed(zoom), zoom, filter_name, supersampling, **options), outputs, overwrite, request)
     say(f"{plural(len(views), 'picture')} in {output}{_told_by_file(zoom if scale is None else 1.0, own_viewer)}")
@@ -194,8 +194,13 @@ def _finished(folder: Path) -> dict[str, str]:
 
 
 @contextmanager
-def _kept(folder: Path, request: str) -> Iterator[None]:
-    """Inside, Ctrl-C says how many pictures are finished, and how to go on; after it all are there, and need not be recorded any more."""
+def _kept(folder: Path, request: str, there: int) -> Iterator[None]:
+    """Inside, Ctrl-C says how many pictures are finished, and how to go on; after it all are there, and need not be recorded any more.
+
+    `there`: how many are finished before, which is said.
+    """
+    if there:
+        note(f"pictures that this command finished before it was interrupted: {there}; they are not rendered again")
     try:
         yield
     except KeyboardInterrupt as interrupt:

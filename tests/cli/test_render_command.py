@@ -113,8 +113,9 @@ def test_render_goes_on_with_the_pictures_that_are_missing(run, model_folder, tm
     if not more:
         assert "exists already; pass --overwrite" in refused(run(*words, "--scale", "1/2"))  # another request is no going on
     drawn += ["so that none is the third"]
-    code, out, _ = run(*words)
+    code, out, err = run(*words)
     assert code == 0 and out.startswith("4 pictures in") and len(drawn) == 3 + 1 + 2
+    assert "finished before it was interrupted: 2; they are not rendered again" in err
     assert sorted(file.suffix for file in (tmp_path / "out").iterdir()) == [".npy"] * 4 + [".png"] * 4
     assert Image.open(tmp_path / "out" / "train_view_1.png").size == (32, 24)
 
