@@ -30,6 +30,7 @@ COMMANDS = {
     "adapt": ["adapt", "base", "--steps", "2"],
     "tiles": ["adapt", "base", "--steps", "2", "--tiles", "2"],
     "levels": ["levels", "base", "--viewer", "antialiased", "--coarsest", "1/2", "--ratio", "2", "--recipe", "instant", "--views", "given"],
+    "render": ["render", "base", "--depth"],
     "evaluate": ["evaluate", "base", "--images", "scene", "--recipe", "instant", "--no-report"],
     "tradeoff": ["tradeoff", "base", "--images", "scene", "--recipe", "instant", "--no-picture"],
 }
