@@ -17,7 +17,7 @@ from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, OwnScale, Up, Viewer
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError, plural, warn
-from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, settled, together, write_json
+from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, settled, sha256, staged, together, write_json
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.progress import counted, note
 from mipmap_plugin.screen_filters import Name
@@ -30,9 +30,8 @@ if TYPE_CHECKING:
 # Endings of pictures, which no folder is called by.
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
 
-# The file in the folder of the pictures that has, until all of a command are there, the names of the finished ones, each with a hash of what it
-# depends on. It is one for all commands, so that none takes pictures for its own that another one has replaced.
-RECORD = "render.resume"
+# The file in the folder of the pictures that has, until all are there, the sha256 of each that is finished; by a hash of what they depend on.
+RECORD = "render_{}.resume"
 
 
 def render(
@@ -85,13 +84,14 @@ def render(
     pictures = [output / name for name in picture_names(told)]
     # Samples are clamped as `evaluate` clamps them, except those that an exposure may still bring into the range of a picture.
     options: RenderOptions = {"viewer": viewer, "filter_3d": filter_3d, "outputs": outputs, "exposure": exposure, "clamped": not exposure}
-    request, finished = _hash(wrapped, views, (zoom, filter_name, supersampling, backend, options)), _finished(output)
-    left = [(view, to) for view, to in zip(views, pictures, strict=True) if finished.get(to.name) != request or not to.is_file()]
+    record = output / RECORD.format(_hash(wrapped, views, (zoom, filter_name, supersampling, backend, options)))
+    finished = _finished(record, pictures)
+    left = [(view, picture) for view, picture in zip(views, pictures, strict=True) if picture.name not in finished]
     _refuse(wrapped, [picture for _, picture in left], outputs, overwrite)
     _check(wrapped, views, exposure)
-    with _kept(output, request, len(views) - len(left)):
+    with _kept(record, finished):
         for camera, picture in counted(left, len(left), "rendering", "view"):
-            _write(picture, wrapped.render(camera.zoomed(zoom), zoom, filter_name, supersampling, **options), outputs, overwrite, request)
+            _write(picture, wrapped.render(camera.zoomed(zoom), zoom, filter_name, supersampling, **options), outputs, overwrite, record, finished)
     say(f"{plural(len(views), 'picture')} in {output}{_told_by_file(zoom if scale is None else 1.0, own_viewer)}")
     _tell_of_cameras(wrapped, cameras)
 
@@ -179,42 +179,25 @@ def _hash(wrapped: Wrapped, views: Sequence[Camera], how: tuple[Any, ...]) -> st
     return hashlib.sha256(json.dumps(facts, sort_keys=True, default=str).encode()).hexdigest()[:DIGITS]
 
 
-def _finished(folder: Path) -> dict[str, str]:
-    """The names of the pictures that interrupted commands finished there, each with the hash of its command.
-
-    Raises SettingsError for another file of the record's name.
-    """
-    record = folder / RECORD
+def _finished(record: Path, pictures: Sequence[Path]) -> dict[str, str]:
+    """The names of the pictures that the same command finished before it was interrupted, each with its sha256; none that was replaced since."""
     try:
-        return dict(json.loads(settled(record).read_text(encoding="utf-8"))["finished"])
-    except OSError:  # there is none, or no folder that can be read
+        told = json.loads(settled(record).read_text(encoding="utf-8"))["finished"]
+    except (OSError, ValueError):  # none, or cut off by a crash of the machine
         return {}
-    except (ValueError, LookupError, TypeError):
-        raise SettingsError(f"{record} is needed for what is finished, but is something else; move it, or choose another output") from None
+    return {each.name: told[each.name] for each in pictures if each.name in told and each.is_file() and sha256(each) == told[each.name]}
 
 
 @contextmanager
-def _kept(folder: Path, request: str, there: int) -> Iterator[None]:
-    """Inside, Ctrl-C says how many pictures are finished, and how to go on; after it all are there, and need not be recorded any more.
-
-    `there`: how many are finished before, which is said.
-    """
-    if there:
-        note(f"pictures that this command finished before it was interrupted: {there}; they are not rendered again")
+def _kept(record: Path, finished: dict[str, str]) -> Iterator[None]:
+    """Say what was finished before; inside, Ctrl-C says how many pictures are, and how to go on; after it all are, and the record is of no use."""
+    if finished:
+        note(f"pictures that this command finished before it was interrupted: {len(finished)}; they are not rendered again")
     try:
         yield
     except KeyboardInterrupt as interrupt:
-        count = plural([*_finished(folder).values()].count(request), "picture")
-        raise KeyboardInterrupt(f"interrupted with {count} finished; run the same command again to go on") from interrupt
-    others = {name: each for name, each in _finished(folder).items() if each != request}
-    if others:
-        _record(folder, others)
-    else:
-        (folder / RECORD).unlink(missing_ok=True)
-
-
-def _record(folder: Path, finished: dict[str, str]) -> None:
-    write_json(folder / RECORD, {"finished": finished}, overwrite=True)
+        raise KeyboardInterrupt(f"interrupted with {plural(len(finished), 'picture')} finished; run the same command again to go on") from interrupt
+    record.unlink(missing_ok=True)
 
 
 def _refuse(wrapped: Wrapped, pictures: Sequence[Path], outputs: Sequence[str], overwrite: bool) -> None:
@@ -229,15 +212,17 @@ def _refuse(wrapped: Wrapped, pictures: Sequence[Path], outputs: Sequence[str], 
         refuse_unwritable(picture)
 
 
-def _write(picture: Path, rendered: Rendered, outputs: Sequence[str], overwrite: bool, request: str) -> None:
+def _write(picture: Path, rendered: Rendered, outputs: Sequence[str], overwrite: bool, record: Path, finished: dict[str, str]) -> None:
     """Write a picture and its other outputs, and that it is finished: all of it or nothing."""
     from mipmap_plugin.formats.images import write_array, write_image
 
-    with together(picture.with_name(RECORD)):
+    with together(record):
         write_image(picture, rendered.image, overwrite=overwrite)
         for name in outputs:
             write_array(_beside(picture, name), getattr(rendered, name), overwrite=overwrite)
-        _record(picture.parent, {**_finished(picture.parent), picture.name: request})
+        now = finished | {picture.name: sha256(staged(picture))}
+        write_json(record, {"finished": now}, overwrite=True)
+    finished.update(now)
 
 
 def _beside(picture: Path, name: str) -> Path:

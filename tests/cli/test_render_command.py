@@ -1,6 +1,5 @@
 """`render`: the pictures that it writes, and their names."""
 
-import json
 from dataclasses import replace
 from unittest.mock import Mock
 
@@ -129,15 +128,6 @@ def test_pictures_that_another_command_has_replaced_are_not_taken_for_finished(r
     assert run(*words, "--scale", "1/2")[0] == 0
     assert run(*words)[0] == 0
     assert {Image.open(file).size for file in (tmp_path / "out").iterdir()} == {(32, 24)}
-
-
-def test_render_keeps_the_record_of_another_command_and_replaces_no_other_file_of_its_name(run, model_folder, tmp_path):
-    words, record = ["render", model_folder, "--output", tmp_path, "--view", "view_0"], tmp_path / "render.resume"
-    record.write_text('{"finished": {"train_view_1.png": "of another"}}')
-    assert run(*words)[0] == 0 and json.loads(record.read_text()) == {"finished": {"train_view_1.png": "of another"}}
-    record.write_text("mine")
-    refused(run(*words, "--overwrite"), "render.resume is needed for what is finished, but is something else; move it")
-    assert record.read_text() == "mine"
 
 
 def test_picture_names_are_unique_and_stay_in_their_folder():
