@@ -88,7 +88,7 @@ def _parse(words: Sequence[str]) -> None:
         raise SettingsError("a word of this command is empty, as where a variable of the shell is not set; fill it in, or leave it out")
     options = words[: words.index("--")] if "--" in words else words  # behind it are names of files
     if dashed := next((word for word in options if DASHED.match(word)), None):
-        raise SettingsError(f"{dashed} begins with a dash, as options do; give a path as ./{dashed}")
+        raise SettingsError(f"{dashed}: options begin with two dashes (but for -h); a path that begins with a dash is given as ./{dashed}")
     if words and (command := COMMANDS.get(words[0])):
         refuse_repeated(command, words)
         prog, summary = f"mipmap-plugin {words[0]}", (getdoc(command) or "").partition("\n\nArgs:")[0]

@@ -22,7 +22,7 @@ from mipmap_plugin.backends.base import Backend, Rendered
 from mipmap_plugin.camera import Camera, checked
 from mipmap_plugin.effects import Effects, as_outputs, explain
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.formats.atomic import named, refuse_output, staged, together, write_json
+from mipmap_plugin.formats.atomic import refuse_output, staged, together, write_json
 from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_image, path_of
@@ -31,7 +31,7 @@ from mipmap_plugin.models.base import SplatModel, checked_splats, digest_of_mode
 from mipmap_plugin.models.exposure import exposed
 from mipmap_plugin.models.mip import for_loader_of, unread
 from mipmap_plugin.models.outputs import cut_off, drawn_otherwise, parts_of, without_place
-from mipmap_plugin.models.places import PAGE_ENDING, REPORT, page_at
+from mipmap_plugin.models.places import REPORT, page_of
 from mipmap_plugin.plugin_errors import naming_any, unchanged
 from mipmap_plugin.process.torch_modes import in_usual_modes, usual_modes
 from mipmap_plugin.progress import announced
@@ -116,9 +116,7 @@ class Adapted:
 
     def _spent(self, path: Path) -> list[Path]:
         """What goes when this is written to `path`: the states of its run, and the page that shows what it replaces."""
-        path = named(path)
-        page = page_at(path.with_name(path.name + PAGE_ENDING)) if path.exists() else []
-        return [file for state in self.states for file in state.files] + page
+        return [file for state in self.states for file in state.files] + page_of(path)
 
     def _judge(self, saved: Path) -> None:
         """Measure a file that is being written, as far as its format rounds splats. Raises CheckpointError if it cannot be read."""

@@ -17,9 +17,9 @@ from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, OwnScale, Up, Viewer
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError, plural, warn
-from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, settled, together, write_json
+from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, settled, sha256, staged, together, write_json
 from mipmap_plugin.jobs.base import Base
-from mipmap_plugin.progress import counted
+from mipmap_plugin.progress import counted, note
 from mipmap_plugin.screen_filters import Name
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 # Endings of pictures, which no folder is called by.
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
 
-# The file in the folder of the pictures that lists the finished ones until all are there, by a hash of what they depend on.
+# The file in the folder of the pictures that has, until all are there, the sha256 of each that is finished; by a hash of what they depend on.
 RECORD = "render_{}.resume"
 
 
@@ -85,8 +85,8 @@ def render(
     # Samples are clamped as `evaluate` clamps them, except those that an exposure may still bring into the range of a picture.
     options: RenderOptions = {"viewer": viewer, "filter_3d": filter_3d, "outputs": outputs, "exposure": exposure, "clamped": not exposure}
     record = output / RECORD.format(_hash(wrapped, views, (zoom, filter_name, supersampling, backend, options)))
-    finished = _finished(record)
-    left = [(view, picture) for view, picture in zip(views, pictures, strict=True) if picture.name not in finished or not picture.is_file()]
+    finished = _finished(record, pictures)
+    left = [(view, picture) for view, picture in zip(views, pictures, strict=True) if picture.name not in finished]
     _refuse(wrapped, [picture for _, picture in left], outputs, overwrite)
     _check(wrapped, views, exposure)
     with _kept(record, finished):
@@ -179,17 +179,20 @@ def _hash(wrapped: Wrapped, views: Sequence[Camera], how: tuple[Any, ...]) -> st
     return hashlib.sha256(json.dumps(facts, sort_keys=True, default=str).encode()).hexdigest()[:DIGITS]
 
 
-def _finished(record: Path) -> list[str]:
-    """The names of the pictures that the same command finished before it was interrupted."""
+def _finished(record: Path, pictures: Sequence[Path]) -> dict[str, str]:
+    """The names of the pictures that the same command finished before it was interrupted, each with its sha256; none that was replaced since."""
     try:
-        return [str(name) for name in json.loads(settled(record).read_text(encoding="utf-8"))["finished"]]
+        told = json.loads(settled(record).read_text(encoding="utf-8"))["finished"]
     except (OSError, ValueError):  # none, or cut off by a crash of the machine
-        return []
+        return {}
+    return {each.name: told[each.name] for each in pictures if each.name in told and each.is_file() and sha256(each) == told[each.name]}
 
 
 @contextmanager
-def _kept(record: Path, finished: Sequence[str]) -> Iterator[None]:
-    """Inside, Ctrl-C says how many pictures are finished, and how to go on; after it all are there, and the record is of no use."""
+def _kept(record: Path, finished: dict[str, str]) -> Iterator[None]:
+    """Say what was finished before; inside, Ctrl-C says how many pictures are, and how to go on; after it all are, and the record is of no use."""
+    if finished:
+        note(f"pictures that this command finished before it was interrupted: {len(finished)}; they are not rendered again")
     try:
         yield
     except KeyboardInterrupt as interrupt:
@@ -209,7 +212,7 @@ def _refuse(wrapped: Wrapped, pictures: Sequence[Path], outputs: Sequence[str], 
         refuse_unwritable(picture)
 
 
-def _write(picture: Path, rendered: Rendered, outputs: Sequence[str], overwrite: bool, record: Path, finished: list[str]) -> None:
+def _write(picture: Path, rendered: Rendered, outputs: Sequence[str], overwrite: bool, record: Path, finished: dict[str, str]) -> None:
     """Write a picture and its other outputs, and that it is finished: all of it or nothing."""
     from mipmap_plugin.formats.images import write_array, write_image
 
@@ -217,8 +220,9 @@ def _write(picture: Path, rendered: Rendered, outputs: Sequence[str], overwrite:
         write_image(picture, rendered.image, overwrite=overwrite)
         for name in outputs:
             write_array(_beside(picture, name), getattr(rendered, name), overwrite=overwrite)
-        write_json(record, {"finished": [*finished, picture.name]}, overwrite=True)
-    finished.append(picture.name)
+        now = finished | {picture.name: sha256(staged(picture))}
+        write_json(record, {"finished": now}, overwrite=True)
+    finished.update(now)
 
 
 def _beside(picture: Path, name: str) -> Path:

@@ -69,8 +69,8 @@ class Staging:
             _note_spent(self._folder, [path for path in spent if path.parent == self.place])
         if not (len(made) == 1 and _moved_at_once(made[0], self.place / made[0].name)):
             for target in (self.place / each.name for each in made):
-                if target.is_file():
-                    os.rename(target, target)  # nothing; an error on Windows, if it is open, so that none is replaced unless all are
+                if os.path.lexists(target):
+                    os.rename(target, target)  # nothing; an error on Windows, if it or a file in it is open: none is replaced unless all are
             ready = self._folder / "ready"
             os.rename(self.new, ready)
             try:

@@ -15,7 +15,7 @@ from mipmap_plugin.formats.atomic import named, new_file, new_folder, refuse_out
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.models import detect
 from mipmap_plugin.models.outputs import parts_of, refuse_parts
-from mipmap_plugin.models.places import conversion_state, state_path
+from mipmap_plugin.models.places import conversion_state, page_of, state_path
 from mipmap_plugin.models.zipped_folder import opened
 from mipmap_plugin.scenes import OPTIONS, load_scene
 
@@ -95,7 +95,7 @@ def unpack(delivery: Delivery, job: Job) -> Outcome:
     base, within = job.base.checkpoint, outcome.file.parts[1:]  # of a model folder
     source, model_folder = (None, base) if base.is_dir() else (base, None)
     refuse_parts(job.target, job.overwrite, source, model_folder, within[0] if within else None)
-    with together(job.target, _states(job.target)), tarfile.open(fileobj=io.BytesIO(delivery.files)) as archive:
+    with together(job.target, [*_states(job.target), *page_of(job.target)]), tarfile.open(fileobj=io.BytesIO(delivery.files)) as archive:
         if within:
             with new_folder(job.target, job.overwrite) as folder:
                 archive.extractall(folder.parent, filter="data")

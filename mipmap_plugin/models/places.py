@@ -82,3 +82,9 @@ def page_at(path: Path) -> list[Path]:
         return []
     with path.open("rb") as file:
         return [path] if PAGE_TITLE in file.read(HEAD) else []
+
+
+def page_of(file: Path) -> list[Path]:
+    """The page that shows the file or folder at this path, if both are there: it goes when that is replaced."""
+    file = named(file)
+    return page_at(file.with_name(file.name + PAGE_ENDING)) if file.exists() else []

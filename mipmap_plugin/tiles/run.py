@@ -25,7 +25,7 @@ from mipmap_plugin.jobs.engines import in_this_process
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.models.inria_folder import cfg_args_for, write_folder
 from mipmap_plugin.models.mip import for_loader_of
-from mipmap_plugin.models.places import REPORT
+from mipmap_plugin.models.places import REPORT, page_of
 from mipmap_plugin.process import threads as thread_pool
 from mipmap_plugin.process.freed_memory import return_freed_memory
 from mipmap_plugin.progress import announced, counted
@@ -229,7 +229,7 @@ def _save(scene: TiledScene, job: Job, files: Sequence[Path], joined: Joined) ->
         with new_file(ply, overwrite) as temporary, temporary.open("xb") as out:
             concatenate(files, comments, out)
 
-    with together(job.target, [scene.folder, lock_of(scene.folder)]):
+    with together(job.target, [scene.folder, lock_of(scene.folder), *page_of(job.target)]):
         if job.target.suffix.lower() == ".ply":
             write(saved := job.target, job.overwrite)
         else:

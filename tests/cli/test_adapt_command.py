@@ -158,11 +158,12 @@ def test_ctrl_c_anywhere_else_says_interrupted(run, model_folder, monkeypatch):
     assert code == 130 and err.strip() == "mipmap-plugin: interrupted"
 
 
-def test_a_page_goes_with_the_file_that_it_shows(run, model_folder, tmp_path):
+@pytest.mark.parametrize("more", [(), ("--tiles", "2")])
+def test_a_page_goes_with_the_file_that_it_shows(run, model_folder, tmp_path, more):
     words = ["adapt", model_folder, "--scale", "1/2", "--output", tmp_path / "a.ply", "--recipe", "instant"]
     run(*words, "--report")
     assert (tmp_path / "a.ply.report.html").exists()
-    run(*words, "--overwrite")
+    assert run(*words, *more, "--overwrite")[0] == 0
     assert (tmp_path / "a.ply").exists() and not (tmp_path / "a.ply.report.html").exists()
 
 

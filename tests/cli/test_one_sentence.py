@@ -34,12 +34,12 @@ def test_the_version(run):
 def test_a_path_that_begins_with_a_dash(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     tiny.ply(Path("./-a.ply"))
-    refused(run("inspect", "-a.ply"), "-a.ply begins with a dash, as options do; give a path as ./-a.ply")
-    refused(run("render", "./-a.ply", "--output", "-out"), "give a path as ./-out")
+    refused(run("inspect", "-a.ply"), "-a.ply: options begin with two dashes (but for -h); a path that begins with a dash is given as ./-a.ply")
+    refused(run("render", "./-a.ply", "--output", "-out"), "is given as ./-out")
     for words in (["./-a.ply"], ["--", "-a.ply"]):
         code, out, _ = run("inspect", "--no-viewers", "--up=-z", *words)
         assert code == 0 and "next: mipmap-plugin adapt ./-a.ply --scale 1/4" in out
-    assert "begins with a dash" not in run("adapt", "./-a.ply", "--scale", "1/2", "--up", "-z", "--steps", "-1")[2]
+    assert "two dashes" not in run("adapt", "./-a.ply", "--scale", "1/2", "--up", "-z", "--steps", "-1")[2]
 
 
 def test_help_names_options_as_they_are_typed():

@@ -1,6 +1,7 @@
 """`render`: the pictures that it writes, and their names."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import moving
 import numpy as np
@@ -111,10 +112,22 @@ def test_render_goes_on_with_the_pictures_that_are_missing(run, model_folder, tm
     if not more:
         assert "exists already; pass --overwrite" in refused(run(*words, "--scale", "1/2"))  # another request is no going on
     drawn += ["so that none is the third"]
-    code, out, _ = run(*words)
+    code, out, err = run(*words)
     assert code == 0 and out.startswith("4 pictures in") and len(drawn) == 3 + 1 + 2
+    assert "finished before it was interrupted: 2; they are not rendered again" in err
     assert sorted(file.suffix for file in (tmp_path / "out").iterdir()) == [".npy"] * 4 + [".png"] * 4
     assert Image.open(tmp_path / "out" / "train_view_1.png").size == (32, 24)
+
+
+def test_pictures_that_another_command_has_replaced_are_not_taken_for_finished(run, model_folder, tmp_path, monkeypatch):
+    words = ["render", model_folder, "--output", tmp_path / "out", "--overwrite"]
+    draw = Wrapped.render
+    with monkeypatch.context() as interrupted:
+        interrupted.setattr(Wrapped, "render", Mock(side_effect=[draw(wrap_model(model_folder), tiny.cameras(1)[0]), KeyboardInterrupt]))
+        assert run(*words)[0] == 130
+    assert run(*words, "--scale", "1/2")[0] == 0
+    assert run(*words)[0] == 0
+    assert {Image.open(file).size for file in (tmp_path / "out").iterdir()} == {(32, 24)}
 
 
 def test_picture_names_are_unique_and_stay_in_their_folder():

@@ -18,7 +18,7 @@ from mipmap_plugin import cli, errors
 from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.errors import OutputError
 from mipmap_plugin.formats import here, staging
-from mipmap_plugin.formats.atomic import new_file, together, write_json
+from mipmap_plugin.formats.atomic import new_file, new_folder, together, write_json
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.jobs.listing import read_list
@@ -30,6 +30,7 @@ COMMANDS = {
     "adapt": ["adapt", "base", "--steps", "2"],
     "tiles": ["adapt", "base", "--steps", "2", "--tiles", "2"],
     "levels": ["levels", "base", "--viewer", "antialiased", "--coarsest", "1/2", "--ratio", "2", "--recipe", "instant", "--views", "given"],
+    "render": ["render", "base", "--depth"],
     "evaluate": ["evaluate", "base", "--images", "scene", "--recipe", "instant", "--no-report"],
     "tradeoff": ["tradeoff", "base", "--images", "scene", "--recipe", "instant", "--no-picture"],
 }
@@ -55,8 +56,7 @@ def test_every_output_is_written_and_replaced_and_nothing_stays_beside_it(tmp_pa
     assert cli.main(words) == 0
     assert cli.main([*words, "--overwrite"]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {"base", "scene", output}
-    own = [file for file in refused if file.startswith(str(tmp_path))]  # numba looks with a nameless file whether a folder is writable
-    assert {os.path.basename(file) for file in own} <= {staging.HELD}  # which marks the folder of a living run
+    assert {os.path.basename(file) for file in refused} <= {staging.HELD}  # which marks the folder of a living run
 
 
 def test_a_folder_is_its_runs_for_as_long_as_that_lives(tmp_path, refused):
@@ -96,6 +96,22 @@ def test_what_is_open_elsewhere_is_replaced_with_its_report_or_not_at_all(tmp_pa
                 with new_file(file, overwrite=True) as temporary:
                     temporary.write_text(text)
     assert report.read_text() == (tmp_path / "out.ply").read_text() == "old" and len([*tmp_path.iterdir()]) == 2
+
+
+def test_a_folder_with_a_file_that_is_open_elsewhere_is_replaced_with_its_report_or_not_at_all(tmp_path, refused):
+    part, report = tmp_path / "out" / "part", tmp_path / "out.json"
+
+    def write(text):
+        with together(part.parent):
+            with new_folder(part.parent, overwrite=True) as temporary:
+                (temporary / part.name).write_text(text)
+            with new_file(report, overwrite=True) as temporary:
+                temporary.write_text(text)
+
+    write("old")
+    with part.open("rb"), pytest.raises(OutputError, match="used by another process"):
+        write("new")
+    assert report.read_text() == part.read_text() == "old" and len([*tmp_path.iterdir()]) == 2
 
 
 def test_a_list_that_powershell_wrote_is_read(tmp_path):

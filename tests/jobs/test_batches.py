@@ -195,7 +195,10 @@ def test_a_list_that_is_no_text(tmp_path):
         read_list(tmp_path / "list")
 
 
-def test_a_list_may_come_from_a_pipe_of_the_shell_but_not_from_one_that_nobody_may_open(tmp_path):
+@pytest.mark.parametrize("macos", [False, True])
+def test_a_list_may_come_from_a_pipe_of_the_shell_but_not_from_one_that_nobody_may_open(tmp_path, monkeypatch, macos):
+    if macos:  # where /dev/fd/3 is no link
+        monkeypatch.setattr(os.path, "realpath", os.fspath)
     os.mkfifo(tmp_path / "list")
     with pytest.raises(SettingsError, match="list: a pipe with a name, whose other end nobody may open; --list takes a text file"):
         read_list(tmp_path / "list")
@@ -204,6 +207,12 @@ def test_a_list_may_come_from_a_pipe_of_the_shell_but_not_from_one_that_nobody_m
         pipe.write("a.ply\n")
         pipe.close()
         assert read_list(Path(f"/dev/fd/{reading}")) == [Path("a.ply")]
+
+
+def test_a_list_that_is_a_link_to_itself(tmp_path):
+    (tmp_path / "list").symlink_to("list")
+    with pytest.raises(SettingsError, match="list: Too many levels of symbolic links; --list takes a text file"):
+        read_list(tmp_path / "list")
 
 
 def test_files_that_adaptations_leave_are_left_out(tmp_path):

@@ -17,6 +17,7 @@ from mipmap_plugin.jobs.finished import finished
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.parcel import do_parcel, pack, unpack
 from mipmap_plugin.jobs.run import run as run_job
+from mipmap_plugin.models.places import PAGE_TITLE
 from mipmap_plugin.process.torchvision_absent import torchvision_optional
 from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.tiles.job import TileJob
@@ -45,6 +46,9 @@ def test_a_job_that_travels_makes_the_same_bytes(tmp_path, given):
     assert {path.name for path in away.target.parent.iterdir()} == {"new.ply", "new.ply.adaptation.json"}
     with pytest.raises(OutputExists):
         unpack(delivery, away)
+    page = away.target.with_name("new.ply.report.html")
+    page.write_bytes(PAGE_TITLE)
+    assert unpack(delivery, replace(away, overwrite=True)).status == "done" and not page.exists()
     failed = unpack(do_parcel(replace(parcel, job=replace(parcel.job, viewer="nobody")), run_job), away)
     assert failed.status == "failed" and "nobody" in failed.reason
 

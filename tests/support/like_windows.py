@@ -6,6 +6,7 @@ import errno
 import mmap
 import os
 import shutil
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -59,6 +60,7 @@ def pretend(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return real(path, flags, mode)
 
     monkeypatch.setattr(shutil, "_use_fd_functions", False)
+    monkeypatch.setattr(tempfile, "TemporaryFile", tempfile.NamedTemporaryFile)  # with it numba asks once for all tests what folder it can write to
     for name, stand_in in {"replace": replace, "rename": rename, "unlink": unlink, "remove": unlink, "rmdir": rmdir, "open": opened}.items():
         monkeypatch.setattr(os, name, stand_in)
     for module, names in LACKING.items():
