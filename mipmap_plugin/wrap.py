@@ -81,6 +81,21 @@ def wrap_model(
     are generated, as there are no cameras, then look from above the horizon. Raises CheckpointError, SceneError,
     ShapeError for tensors that do not fit together, and SettingsError for an unknown filter or axis, or an object that is not a model.
     """
+    wrapped, scene = wrap_unchecked(model, cameras, backend, threads, **options)
+    if cameras is not None and scene is not None:
+        _warn_of_others(wrapped, scene)
+    return wrapped
+
+
+@in_usual_modes
+def wrap_unchecked(
+    model: SplatModel | str | Path | Any,
+    cameras: Sequence[Camera] | Scene | str | Path | None,
+    backend: str = "auto",
+    threads: int | None = None,
+    **options: Unpack[WrapOptions],
+) -> tuple[Wrapped, Scene | None]:
+    """`wrap_model` without comparing the base with photographs, of which a sample of its splats shows little; and its cameras' scene, if any."""
     check_names("wrap_model", options, WrapOptions, ("cameras", "backend", "threads"))
     check_serves(backend, threads)
     background, screen_filter, up = options.get("background"), options.get("screen_filter"), options.get("up")
@@ -101,9 +116,7 @@ def wrap_model(
     there = placed(model, found) if isinstance(found, Scene) else None
     wrapped = Wrapped(model, there.cameras if there else given, backend, trained, threads)
     wrapped.loading_s, wrapped.asked, wrapped.cameras_from = loading_s, asked_for(model.folder, given, color, screen_filter, up), read_from
-    if cameras is not None and there is not None:
-        _warn_of_others(wrapped, there)
-    return wrapped
+    return wrapped, there
 
 
 def axis_of(up: str) -> tuple[float, float, float]:

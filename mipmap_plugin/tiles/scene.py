@@ -38,7 +38,7 @@ from mipmap_plugin.tiles.slabs import Painter
 from mipmap_plugin.tiles.splats import Splats
 from mipmap_plugin.tiles.store import Store
 from mipmap_plugin.tiles.sweeps import Sweep, sweeps, views_of
-from mipmap_plugin.wrap import Wrapped, wrap_model
+from mipmap_plugin.wrap import Wrapped, wrap_unchecked
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ class TiledScene:
         if self.kind is SurfelModel:
             trained = flat_trained(trained)
         model = self.kind(self.base.parameters(sample), trained, origin)
-        return wrap_model(model, cameras=base.cameras, background=COLORS[base.background], screen_filter=base.screen_filter, up=base.up)
+        return wrap_unchecked(model, base.cameras, background=COLORS[base.background], screen_filter=base.screen_filter, up=base.up)[0]
 
     def _backend(self, name: str) -> tuple[Any, str]:
         splats = self.wrapped.model.gaussians(self.wrapped.any_camera())

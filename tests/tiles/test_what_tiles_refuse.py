@@ -14,6 +14,8 @@ from cut_scenes import cut_in_three, report, rewritten
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import BackendUnavailable, CheckpointError, SettingsError
 from mipmap_plugin.formats.magic import SPLAT_RECORD
+from mipmap_plugin.jobs.base import Base
+from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.health import ACTIVATED
 from mipmap_plugin.tiles.folder import work_folder
@@ -174,3 +176,11 @@ def test_jobs_of_several_bases_or_of_one_output_are_refused(job, tmp_path):
 def test_commands_that_cannot_be(words, reason, capsys):
     assert main(["adapt", *words.split()]) == 2
     assert reason in capsys.readouterr().err
+
+
+def test_a_sample_of_the_splats_is_not_compared_with_the_photographs_of_cameras(tmp_path, monkeypatch, recwarn):
+    """It shows next to nothing of them."""
+    monkeypatch.setattr("mipmap_plugin.tiles.reading.SAMPLE", 3)
+    base = Base(tiny.ply(tmp_path / "base.ply"), tiny.scene(tmp_path / "scene", train=tiny.cameras(4)))
+    adapt_in_tiles(Job(base, tmp_path / "out.ply", 0.5, recipe="instant"), 2)
+    assert not any("another scene" in str(warning.message) for warning in recwarn)

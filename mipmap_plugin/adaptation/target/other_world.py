@@ -13,6 +13,7 @@ from mipmap_plugin.adaptation.curve import psnr_as_shown
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.camera import Camera, evenly
+from mipmap_plugin.progress import announced
 
 # So many photographs are looked at, at so many px of the shorter side; they tell as much as all do at their own size.
 MOST_VIEWS, LOOK = 8, 128
@@ -25,6 +26,7 @@ HALF_TURNS = {"y": (-1.0, 1.0, -1.0), "x": (1.0, -1.0, -1.0), "z": (-1.0, -1.0, 
 SAME_POSE = 1e-5
 
 
+@announced("comparing the base with photographs")
 def doubt_about(
     cameras: Sequence[Camera],
     photograph: Callable[[Camera], Tensor],
