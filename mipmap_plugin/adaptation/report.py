@@ -162,6 +162,9 @@ def changes(base: SplatModel, adapted: SplatModel, scale: float) -> list[str]:
     if (rows := base.traits.rows) != SPLATS:
         left, all_of_them = (len(model.parameters()["means"]) for model in (adapted, base))
         found.append(f"{left:,} of {all_of_them:,} {rows} are left; the splats counted are those of one view")
+    degree, before_it = (getattr(model, "sh_degree", 0) for model in (adapted, base))
+    if degree > before_it:
+        found.append(f"colors depend on the view up to SH degree {degree}, those of the base up to {before_it}: merging had made room for it")
     moved = {name.partition(".")[0] for name, tensor in adapted.shared_parameters().items() if not torch.equal(tensor, before[name])}
     if moved:
         found.append(f"what the {rows} share has changed too: {', '.join(sorted(moved))}")

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 
 from torch import Tensor
 
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.viewpoints import Viewpoints
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import Camera, digest_of
+from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.models.base import SplatModel, digest_of_model, digest_of_parameters
 
 # (step, seconds of adapting so far, function that renders a camera of the new scale with the current model, without gradients)
 # -> True (Python's, NumPy's or torch's) to end the run with this step, and anything else to go on. Its time is not counted.
@@ -39,3 +42,10 @@ class AdaptationRequest:
     finer: FinerLevel | None = None  # what the run starts from instead of the base
     inputs: Mapping[str, str] = field(default_factory=dict)  # `Report.inputs`
     budget_share: float = 1.0  # of the time budget that was asked for, which the settings have
+
+    def fingerprint(self, scale: float, config: AdaptConfig, views: Sequence[Camera]) -> str:
+        """A hash of everything that a run to `scale` depends on, so that a state is never resumed as another run."""
+        base = digest_of_model(self.images.model) + ("" if self.finer is None else digest_of_parameters(self.finer.model))
+        targets = [asdict(target) for target in self.targets.values()]
+        by = [self.images.backend.name, asdict(self.images.effects), targets, digest_of(views)]
+        return hashlib.sha256(json.dumps([base, dict(self.inputs), scale, config.model_dump(), *by]).encode()).hexdigest()

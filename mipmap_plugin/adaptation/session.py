@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch
+from mipmap_plugin.adaptation.drawn import Drawn
 from mipmap_plugin.adaptation.following import Following, release
 from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_trained, psnr_per_viewer, too_far_out
 from mipmap_plugin.adaptation.moments import at_their_moments, evaluate_moments
@@ -28,20 +27,21 @@ from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, color
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, option_note, simulated, versions
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer, ends_run
 from mipmap_plugin.adaptation.shown import refuse_blind, remarks, showing, too_unlike, worse_views
+from mipmap_plugin.adaptation.start.bands import with_more_bands
 from mipmap_plugin.adaptation.start.candidates import UNMATCHED, best_start
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
 from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.adaptation.target.detail import DetailLoss, unused_upsampler
 from mipmap_plugin.adaptation.target.photographs import Photographs
-from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
+from mipmap_plugin.adaptation.target.portable import median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.views import choose_views, over_band
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Calls
-from mipmap_plugin.camera import ONE_PIXEL, Camera, digest_of, evenly
+from mipmap_plugin.camera import ONE_PIXEL, Camera, evenly
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.models.base import SplatModel, count_of, digest_of_model, digest_of_parameters, places
+from mipmap_plugin.models.base import SplatModel, count_of, digest_of_model, places
 from mipmap_plugin.models.health import doubts_in
 from mipmap_plugin.process import pool, threads
 from mipmap_plugin.process.clock import now
@@ -60,16 +60,16 @@ class Session:
     wanted: float | None = None  # where this is a conversion: the scale of the zoom-in that starts from what it returns; so its state is kept
 
     def __init__(self, request: AdaptationRequest, scale: float, config: AdaptConfig, cameras: list[Camera], photographs: Photographs | None) -> None:
-        self.request, self.scale, self.targets, self.finer = request, scale, request.targets, request.finer
-        self.base, self.backend, self.base_effects = request.images.model, request.images.backend, request.images.effects
-        self.effects, self.extremes = next(iter(self.targets.values())), extreme_targets(self.targets)
-        self.asked, self.config = config, affordable_for_model(config, self.base, cameras, self.effects.near_plane)
+        self.request, self.scale, self.finer = request, scale, request.finer
+        self.base, self.backend = request.images.model, request.images.backend
+        self.drawn = Drawn(request.images.effects, request.targets).with_bands(self.finer.used_sh_degree() if self.finer else 0)
+        self.asked, self.config = config, affordable_for_model(config, self.base, cameras, self.drawn.effects.near_plane)
         self._most_splats, self.device = config.most_splats or sys.maxsize, self.base.parameters()["means"].device
         self.viewpoints = replace(request.viewpoints, looks=looks_in_budget(self.config, self.base))
         self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.device)
         self._has_photographs, self._orbits = photographs is not None, not cameras or config.views == "orbit"
         self.base_views, validation, self.views_note = self._choose_views(cameras)
-        self.config = config = fitting(self.config, self.base_effects, self.base_views, scale)
+        self.config = config = fitting(self.config, self.drawn.base, self.base_views, scale)
         self.seconds["total"] = sum(self.seconds.values())
         self._closest_of = cameras if scale > 1 and cameras else self.base_views  # a zoom-in is as fine as what the base was seen from
         self.views = over_band(self.base_views, config)
@@ -81,8 +81,7 @@ class Session:
         if self.detail is not None:
             self.views = evenly(self.views, min(config.upsampled_views, config.steps * config.views_per_step))
         truth = PseudoTruth(request.images, scale, config.model_copy(update=COMPARED_WITH_BASE if scale > 1 else {}))
-        renders = [Renderer(self.backend, target) for target in self.extremes.values()]
-        self.validation = Validation(steering, choosing, scale, truth, renders, config.resize)
+        self.validation = Validation(steering, choosing, scale, truth, self.drawn.renders(self.backend), config.resize)
 
     def _choose_views(self, cameras: list[Camera]) -> tuple[list[Camera], list[Camera], str]:
         """The views to adapt to, the views for validation, and a description of the former."""
@@ -90,7 +89,7 @@ class Session:
             chosen, note = choose_views(cameras, self.viewpoints, self.config)
             views, validation = split_validation(cameras, chosen, self.viewpoints, self.scale, self.config)
         note += f", {len(chosen) - len(views)} of them kept for validation" if len(views) < len(chosen) else ""
-        shown = showing(validation, places(self.base, chosen[0]), self.base_effects.near_plane)
+        shown = showing(validation, places(self.base, chosen[0]), self.drawn.base.near_plane)
         if len(shown) > 1:  # one to steer by, and one to choose by; others are the same in every state
             validation = shown
         if self.base.traits.moves:
@@ -104,21 +103,21 @@ class Session:
         if not (self._orbits and self.viewpoints.orbit.nearest):
             return nullcontext()
         with self.phase("compilation"):
-            warm_up(self.backend, self.base.gaussians(ONE_PIXEL), [self.base_effects], Calls(gradients=False, merging=False))
+            warm_up(self.backend, self.base.gaussians(ONE_PIXEL), [self.drawn.base], Calls(gradients=False, merging=False))
         return self.phase("views")
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
         """Adapt the base, or continue the run that `resume` holds, and return the best state."""
-        near, wanted = self.base_effects.near_plane, self.wanted or self.scale
+        near, wanted = self.drawn.base.near_plane, self.wanted or self.scale
         refuse_blind(self.base_views, self.base, near, self.truth, wanted)
         if self._base_is_right:
             copy, reason = self._for_target(self.base), "scale 1, at which the base is right as it is"
-            return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
-        found = [too_unlike(self.base_views), too_far_out(self.base, self.base_views, self.targets), unused_upsampler(self.config, wanted)]
+            return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.drawn.effects, self.drawn.targets)
+        found = [too_unlike(self.base_views), too_far_out(self.base, self.base_views, self.drawn.targets), unused_upsampler(self.config, wanted)]
         for remark in filter(None, [*remarks(self.base_views, self.base, near, orbit=self._orbits), *found, option_note(self.base, wanted)]):
             warn(remark)
         began = now(self.device) - self.seconds["total"]
-        self._compile()
+        self._compile(self.base)
         evaluate_moments(self.base, [*self.views, *self.validation.steering], self.phase)
         initial, start, notes = best_start(self._start_problems())
         self.notes = [note for note in notes if note == UNMATCHED or not (self.finer and self.finer.converts)]
@@ -128,30 +127,39 @@ class Session:
         pool.release_to_system()
         self.seconds["total"] = now(self.device) - began
         if self._takes_steps:
-            run, ended_by = self._optimize(initial.copy(), resume, observe)
+            run, ended_by = self._optimize((initial := self._with_more_bands(initial)).copy(), resume, observe)
             curve, states = run.curve, states | run.states(initial)
         return self._select(states, curve, ended_by)
 
-    def _compile(self) -> None:
-        """Let the backend compile what the run will call, in a phase of its own."""
-        merging, effects = self.config.merge_to < 1 and self._has_blend_weights, (self.base_effects, *self.targets.values())
+    def _compile(self, model: SplatModel) -> None:
+        """Let the backend compile what the run will call for splats such as the model's, in a phase of its own."""
+        merging, effects = self.config.merge_to < 1 and self._has_blend_weights, (self.drawn.base, *self.drawn.targets.values())
         takes_steps, by_rows = self._takes_steps, self.base.traits.plain and self.config.densify_gradient is None
         with self.phase("compilation"):
             calls = calls_of(self.views, self.scale, self.config.views_per_step, gradients=takes_steps, merging=merging, by_rows=by_rows)
-            warm_up(self.backend, self.base.gaussians(self.views[0]), effects, calls)
+            warm_up(self.backend, model.gaussians(self.views[0]), effects, calls)
 
     def _start_problems(self) -> list[StartProblem]:
         from_base = StartProblem(
-            lambda: self._for_target(self.base, shared=True), self.base_views, self._closest_of, self.scale, self.base_effects,
-            median_target(self.targets), self.config, self.backend, self._has_blend_weights, self.quality, self.phase,
-            may_lose=self.config.merging_costs if len(self.targets) > 1 and self.config.steps else 0.0,
+            lambda: self._for_target(self.base, shared=True), self.base_views, self._closest_of, self.scale, self.drawn.base,
+            median_target(self.drawn.targets), self.config, self.backend, self._has_blend_weights, self.quality, self.phase,
+            may_lose=self.config.merging_costs if len(self.drawn.targets) > 1 and self.config.steps else 0.0,
         )  # fmt: skip
         if (finer := self.finer) is None:
             return [from_base]
         from_level = from_base.from_level(finer, lambda: self._for_target(finer.model, shared=True))
-        if not finer.converts:
-            return [from_level]
-        return [from_level, from_base] if finer.learned else [from_base, from_level]
+        both = [from_level, from_base] if finer.learned else [from_base, from_level]
+        return both if finer.converts else [from_level]
+
+    def _with_more_bands(self, start: SplatModel) -> SplatModel:
+        """The start with the SH bands that it has room for, which are drawn from now on."""
+        most = min(self.config.most_sh_degree, max(self.drawn.most.values())) if self.config.most_splats is None else 0
+        start, degree = with_more_bands(start, self.base, self.request.images.effects.sh_degree, most)
+        before, self.drawn = self.drawn, self.drawn.with_bands(degree)
+        if self.drawn != before:
+            self.validation = replace(self.validation, renders=self.drawn.renders(self.backend))
+            self._compile(start)
+        return start
 
     def _select(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str) -> Adapted:
         """Return the best of the states on views that did not steer the run, or the last where the settings say so."""
@@ -174,23 +182,23 @@ class Session:
         report = self._report(states[best], curve or [at_end], ended_by, f"{best}{note}", psnrs)
         used, files = [*self.views, *self.validation.steering, *self.validation.choosing], [self.state] if self.state else []
         model = states[best].copy() if getattr(states[best], "shares", False) else states[best]
-        return Adapted(model, report, self.backend, self.effects, self.targets, files, used, judge=self.validation.kept())
+        return Adapted(model, report, self.backend, self.drawn.effects, self.drawn.targets, files, used, judge=self.validation.kept())
 
     def _task(self, student: SplatModel, renders: Sequence[Renderer]) -> Task:
         """What is optimized from `student` on: up to how many splats, and by which of the ways to draw them that the backend has."""
         growth, targets = self.config.most_growth, [renderer.effects for renderer in renders]
         return Task(
-            self.views, self.scale, self.truth, renders, self.effects.background == (1.0, 1.0, 1.0), self.validation, self.detail,
+            self.views, self.scale, self.truth, renders, self.drawn.effects.background == (1.0, 1.0, 1.0), self.validation, self.detail,
             max_splats=self._most_splats if growth is None else min(self._most_splats, int(growth * len(student.parameters()["means"]))),
-            render_views=views_renderer(self.backend, targets), color_limits=color_limits(self.extremes.values()),
+            render_views=views_renderer(self.backend, targets), color_limits=color_limits(self.drawn.extremes.values()),
             render_to_step=SteppingRenderer.of(self.backend, targets), follow=Following(self.base, self.views, self.scale),
         )  # fmt: skip
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
         """Run Algorithm 1 on `student`, or continue it from the state in `resume`; return the run and what ended it."""
-        renders = [Renderer(self.backend, unrounded(target)) for target in self.extremes.values()]
-        keeper = StateKeeper(resume, self._fingerprint())
-        if not any(target.sh_degree for target in self.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
+        renders = [Renderer(self.backend, unrounded(target)) for target in self.drawn.extremes.values()]
+        keeper = StateKeeper(resume, self.request.fingerprint(self.scale, self.config, self.views))
+        if not any(target.sh_degree for target in self.drawn.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no viewer evaluates view-dependent color, so that these coefficients need no gradient
         if self.detail is not None and (seconds := for_upsampling(self.config, self.seconds["total"], resume)) > 0:
             with self.phase("upsampling"), threads.lent_to_torch():
@@ -228,7 +236,7 @@ class Session:
     def _for_target(self, model: SplatModel, *, shared: bool = False) -> SplatModel:
         """A copy of a model that is rendered with the target's screen filter; `shared`: with the model's tensors, if it can have these."""
         model = getattr(model, "shared", model.copy)() if shared else model.copy()
-        model.trained = model.trained.drawn_with(self.effects)
+        model.trained = model.trained.drawn_with(self.drawn.effects)
         return model
 
     @contextmanager
@@ -248,29 +256,22 @@ class Session:
     def _base_is_right(self) -> bool:
         """Whether the base is the answer as it is: at its own scale, where it is drawn as in its training, and no splats are too many."""
         few = len(self.base.parameters()["means"]) <= self._most_splats
-        return self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values())
+        return self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.drawn.base for target in self.drawn.targets.values())
 
     @property
     def _takes_steps(self) -> bool:
-        return self._has_photographs or takes_steps(self.config, self.scale, self.base_effects, self.targets.values())
+        return self._has_photographs or takes_steps(self.config, self.scale, self.drawn.base, self.drawn.targets.values())
 
     @property
     def _has_blend_weights(self) -> bool:
         return self.request.has_gradients and self.base.traits.same_for_all_views
 
-    def _fingerprint(self) -> str:
-        """A hash of everything that a run depends on, so that a state is never resumed as another run."""
-        base = digest_of_model(self.base) + ("" if self.finer is None else digest_of_parameters(self.finer.model))
-        targets, settings, views = [asdict(target) for target in self.targets.values()], self.config.model_dump(), digest_of(self.views)
-        facts = [base, dict(self.request.inputs), self.scale, settings, self.backend.name, asdict(self.base_effects), targets, views]
-        return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
-
     def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str, returned: str, validation: dict[str, float]) -> Report:
         known = [*self.base.notes, *(self.finer.model.notes if self.finer else ())]
         notes = [*self.notes, *(note for note in student.notes if note not in known)]
-        as_trained = psnr_as_trained(self.validation, self.backend, self.targets, self.base, self.base_effects)
+        as_trained = psnr_as_trained(self.validation, self.backend, self.drawn.targets, self.base, self.drawn.base)
         shown = next((psnr for state, psnr in validation.items() if returned.startswith(state)), 0.0)
-        notes += better_as_trained(as_trained, shown, self.base_effects)
+        notes += better_as_trained(as_trained, shown, self.drawn.base)
         for note in notes:
             warn(note)
         return Report(
@@ -280,15 +281,15 @@ class Session:
             backend=self.request.backend_note,
             views=self.views_note,
             viewer=self.request.viewer,
-            filters=filters(self.scale, self.config, self.base_effects, list(self.targets.values())),
-            effects=simulated(self.base, self.views[0], self.targets.values(), self.config, self.scale),
+            filters=filters(self.scale, self.config, self.drawn.base, list(self.drawn.targets.values())),
+            effects=simulated(self.base, self.views[0], self.drawn.targets.values(), self.config, self.scale),
             gaussians_before=count_of(self.base, self.views[0], self.scale),
             gaussians_after=count_of(student, self.views[0], self.scale),
             seconds=self.seconds,
             ended_by=ended_by,
             returned=returned,
             validation=validation,
-            viewers=psnr_per_viewer(self.validation, self.backend, self.targets, student) if validation else {},
+            viewers=psnr_per_viewer(self.validation, self.backend, self.drawn.targets, student) if validation else {},
             as_trained=as_trained,
             peak_memory_mib=self.peak.mib(),
             curve=curve,

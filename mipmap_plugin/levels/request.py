@@ -108,8 +108,11 @@ class LadderRequest:
         return self.arguments({} if base.target(self.viewer) == base.effects() else band.settings())
 
     def arguments(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """The arguments of `adapt` for a level with these settings; those of the request override them."""
-        return {"recipe": self.recipe, "viewer": self.viewer, **settings, **self.settings}
+        """The arguments of `adapt` for a level with these settings; those of the request override them.
+
+        Levels get no SH bands beyond the base's: merging does not make room for a file there, but for further levels.
+        """
+        return {"recipe": self.recipe, "viewer": self.viewer, "most_sh_degree": 0, **settings, **self.settings}
 
     def next_ratio(self, shown_down_to: float, ratio: float) -> float:
         """The ratio below a level that is shown down to this zoom, after levels of the given ratio."""

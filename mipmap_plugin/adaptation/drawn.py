@@ -1,0 +1,52 @@
+"""How a run draws the base, and what it makes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from mipmap_plugin.adaptation.renderers import Renderer
+from mipmap_plugin.adaptation.target.portable import extreme_targets
+from mipmap_plugin.backends.base import Backend
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.splatting.viewers import find_viewer
+
+# Bands that every renderer of training evaluates, as most viewers do (`Viewer.sh_degree`).
+USUAL_DEGREE = 3
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """The effects of both. Raises SettingsError for a viewer that is not registered."""
+
+    base: Effects
+    targets: Mapping[str, Effects]  # by viewer; the file names the first of them
+
+    @property
+    def effects(self) -> Effects:
+        """Those of the first viewer."""
+        return next(iter(self.targets.values()))
+
+    @cached_property
+    def extremes(self) -> dict[str, Effects]:
+        """The targets that steps draw."""
+        return extreme_targets(self.targets)
+
+    def renders(self, backend: Backend) -> list[Renderer]:
+        """What draws as each of the extremes does."""
+        return [Renderer(backend, target) for target in self.extremes.values()]
+
+    @cached_property
+    def most(self) -> Mapping[str, int]:
+        """The degree of the SH bands that each viewer draws."""
+        return {name: find_viewer(name).sh_degree if name else USUAL_DEGREE for name in self.targets}
+
+    def with_bands(self, degree: int) -> Drawn:
+        """The same with SH bands up to `degree`, as far as viewers draw them. The base, which may have fewer, looks the same by it."""
+        targets = {name: _at_least(target, min(degree, self.most[name])) for name, target in self.targets.items()}
+        return Drawn(_at_least(self.base, degree), targets)
+
+
+def _at_least(effects: Effects, degree: int) -> Effects:
+    return replace(effects, sh_degree=max(effects.sh_degree, degree))

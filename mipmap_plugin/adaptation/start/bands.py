@@ -1,0 +1,28 @@
+"""SH bands that a zoom-out adds where merging has made room for them.
+
+A viewer's dilation takes sharpness from every picture, and colors that depend on the view bring some of it back (docs/recipes_found.md). Splats of
+phones and of the web's formats often have no bands, or one.
+"""
+
+from __future__ import annotations
+
+from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.models.vanilla import VanillaModel
+
+
+def with_more_bands(start: SplatModel, base: SplatModel, used: int, most: int) -> tuple[SplatModel, int]:
+    """The start, with SH bands of zeros where need be, and the degree up to which it has room for them: at most `most`, and at least `used`.
+
+    So many that it has no more numbers than the base, of whose bands those up to `used` count, as the others are 0. A checkpoint of gsplat's or
+    nerfstudio's own keeps its bands, which are part of what its program expects.
+    """
+    if not isinstance(start, VanillaModel) or start.traits.placed:
+        return start, used
+    room = len(base.parameters()["means"]) * _numbers(used)
+    degree = max(used, *(each for each in range(most + 1) if len(start) * _numbers(each) <= room), 0)
+    return start.with_degree(degree) if degree > start.sh_degree else start, degree
+
+
+def _numbers(degree: int) -> int:
+    """What a splat of 3DGS has: center, rotation, scales, opacity and color."""
+    return 3 + 4 + 3 + 1 + 3 * (degree + 1) ** 2

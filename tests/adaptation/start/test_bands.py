@@ -1,0 +1,79 @@
+"""SH bands that a zoom-out adds where merging has made room for them."""
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin import wrap_model
+from mipmap_plugin.adaptation.start.bands import with_more_bands
+from mipmap_plugin.levels.request import LadderRequest
+from mipmap_plugin.models import load_model
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.vanilla import VanillaModel
+
+NUMBERS = {0: 14, 1: 23, 2: 38, 3: 59}  # of a splat, by degree
+STEPS = dict(steps=12, merging_costs=30.0)  # so that merging is allowed whatever it costs
+
+
+def crowd(degree=0, room=None):
+    """Splats of which so many share a pixel at x1/8 that merging leaves a few; `room`: the degree that their arrays have."""
+    splats = tiny.gaussians(200, degree=max(degree, room or 0), spread=0.3)
+    splats.sh[:, (degree + 1) ** 2 :] = 0
+    return wrap_model(VanillaModel.from_gaussians(splats, TrainedScale()), cameras=tiny.cameras(8, width=96, height=72))
+
+
+@pytest.mark.parametrize("used", [0, 1, 2, 3])
+@pytest.mark.parametrize("left", [20, 45, 60, 90, 160, 200])
+def test_bands_are_those_that_leave_no_more_numbers_than_the_base_has(used, left):
+    start = tiny.model(left, degree=used)
+    fitting = [degree for degree in NUMBERS if degree >= used and left * NUMBERS[degree] <= 200 * NUMBERS[used]]
+    padded, degree = with_more_bands(start, tiny.model(200, degree=used), used, 3)
+    assert padded.sh_degree == degree == max(fitting)
+    splats = padded.gaussians()
+    assert torch.equal(splats.sh[:, : (used + 1) ** 2], start.gaussians().sh)
+    assert not splats.sh[:, (used + 1) ** 2 :].any()
+
+
+def test_no_bands_are_added_beyond_those_that_are_asked_for():
+    padded, degree = with_more_bands(tiny.model(10, degree=0), tiny.model(200, degree=0), 0, 1)
+    assert padded.sh_degree == degree == 1
+
+
+def test_bands_that_a_file_has_for_nothing_make_no_room():
+    padded, degree = with_more_bands(tiny.model(200, degree=3), tiny.model(200, degree=3), 0, 3)
+    assert (padded.sh_degree, degree) == (3, 0)
+
+
+def test_merged_splats_learn_colors_that_depend_on_the_view(tmp_path):
+    base = crowd()
+    adapted = base.adapt(1 / 8, **STEPS)
+    plain = base.adapt(1 / 8, **STEPS, most_sh_degree=0)
+    assert adapted.report.gaussians_after < 200 * NUMBERS[0] / NUMBERS[2]
+    assert adapted.model.gaussians().used_sh_degree() == 2 and plain.model.gaussians().used_sh_degree() == 0
+    assert adapted.report.psnr_after() > plain.report.psnr_after()
+    assert any("up to SH degree 2" in note for note in adapted.report.notes)
+    view = base.views()[0].zoomed(1 / 8)
+    again = load_model(adapted.save(tmp_path / "small.ply"))
+    assert torch.allclose(wrap_model(again).render(view).image, adapted.render(view).image, atol=1e-5)
+
+
+def test_bands_that_a_file_has_for_nothing_are_used_where_merging_has_made_room():
+    adapted = crowd(room=3).adapt(1 / 8, **STEPS)
+    assert adapted.model.sh_degree == 3 and adapted.model.gaussians().used_sh_degree() == 2
+
+
+@pytest.mark.parametrize("options", [dict(most_splats=40), dict(viewer="gaussian-splats-3d"), dict(recipe="paper"), dict(steps=0)])
+def test_no_bands_are_added_for(options):
+    """A number of splats that stands for bytes, a viewer that draws none, the published method, and where nothing is learned."""
+    assert crowd().adapt(1 / 8, **STEPS | options).model.sh_degree == 0
+
+
+def test_levels_have_the_bands_of_their_base():
+    assert LadderRequest("supersplat").arguments({})["most_sh_degree"] == 0
+
+
+def test_what_begins_with_splats_that_got_bands_draws_them():
+    base = crowd()
+    finer = base.adapt(1 / 8, **STEPS)
+    coarser = base.adapt(1 / 10, start=finer, steps=0)
+    assert finer.model.gaussians().used_sh_degree() == coarser.model.gaussians().used_sh_degree() == coarser.effects.sh_degree == 2
