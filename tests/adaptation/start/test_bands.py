@@ -52,6 +52,8 @@ def test_merged_splats_learn_colors_that_depend_on_the_view(tmp_path):
     assert adapted.model.gaussians().used_sh_degree() == 2 and plain.model.gaussians().used_sh_degree() == 0
     assert adapted.report.psnr_after() > plain.report.psnr_after()
     assert any("up to SH degree 2" in note for note in adapted.report.notes)
+    color = next(effect for effect in adapted.report.effects if effect.name == "view-dependent color")
+    assert color.on and color.reason == "SH up to degree 2, of the base up to 0: merging has made room for more"
     view = base.views()[0].zoomed(1 / 8)
     again = load_model(adapted.save(tmp_path / "small.ply"))
     assert torch.allclose(wrap_model(again).render(view).image, adapted.render(view).image, atol=1e-5)
