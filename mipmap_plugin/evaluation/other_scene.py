@@ -9,7 +9,7 @@ from mipmap_plugin.adaptation.target.photographs import names_of
 from mipmap_plugin.evaluation.protocols import Protocol, TestView, TruthView
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.scenes import Scene
-from mipmap_plugin.scenes.cameras_json import photographs_folder, trained_size
+from mipmap_plugin.scenes.training_options import photographs_folder, trained_size
 from mipmap_plugin.wrap import Wrapped
 
 # px: a size that was rounded in other ways is no other size.

@@ -17,7 +17,7 @@ from mipmap_plugin.errors import SceneError, plural, some_of
 from mipmap_plugin.formats.images import image_size, is_file, read_array
 from mipmap_plugin.formats.json_file import numbers, pixels, positive, present, read_json, rotation
 from mipmap_plugin.scenes.base import Scene
-from mipmap_plugin.scenes.cameras_json import DEFORMABLE, trained_size
+from mipmap_plugin.scenes.training_options import DEFORMABLE, trained_size
 from mipmap_plugin.scenes.transforms import viewmat_from_opengl
 
 # DyNeRF: px of the recorded width, to which focal lengths refer, and of the training size; and the number of frames of a video.
