@@ -38,7 +38,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_image, check_kinds, check_names, check_scale, path_of
 from mipmap_plugin.models.base import Filtered, SplatModel, TrainedScale, tensors_of, why_no_viewer
 from mipmap_plugin.models.contract import checked_splats
-from mipmap_plugin.models.mip import filter_3d_of, smooth_3d, wants_filter
+from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
 from mipmap_plugin.models.outputs import parts_of
 from mipmap_plugin.models.places import REPORT, state_path
 from mipmap_plugin.plugin_errors import naming_any, unchanged
@@ -262,7 +262,7 @@ class FrozenBase:
 
     def read_by(self, viewer: str | None) -> SplatModel:
         """The base as a viewer reads its file: without its 3D filter if the viewer does not read it."""
-        reads_all = viewer is None or not self.model.traits.filtered or wants_filter(viewer)
+        reads_all = viewer is None or not self.model.traits.filtered or all(find_viewer(name).filter_3d for name in viewers_for(viewer))
         return self.model if reads_all else cast(Filtered, self.model).bare()
 
     @in_usual_modes

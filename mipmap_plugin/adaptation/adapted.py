@@ -29,7 +29,7 @@ from mipmap_plugin.limits import check_image, path_of
 from mipmap_plugin.models import contract, load_model
 from mipmap_plugin.models.base import SplatModel, digest_of_model, effects_of, tensors_of
 from mipmap_plugin.models.exposure import exposed
-from mipmap_plugin.models.mip import for_loader_of, unread
+from mipmap_plugin.models.loaders import for_loader_of, unread
 from mipmap_plugin.models.outputs import cut_off, drawn_otherwise, parts_of, without_place
 from mipmap_plugin.models.places import REPORT, page_of
 from mipmap_plugin.plugin_errors import naming_any, unchanged
