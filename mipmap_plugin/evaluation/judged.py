@@ -94,10 +94,10 @@ def photographed_views(model: Wrapped, scene: Scene) -> list[JudgedView]:
 
 
 def judged_views(scene: Scene, base: Sequence[Camera], background: tuple[float, float, float]) -> list[JudgedView]:
-    """The photographs of a scene that are compared with, with their cameras at the pixel density of the cameras of the base.
+    """The photographs of a scene that are marked as test, with their cameras at the pixel density of the cameras of the base.
 
-    If none is marked as test, those that the base holds out, by their poses, and else all (`not_held_out` says so). Raises SettingsError without
-    photographs, SceneError for a damaged one.
+    If none is, those that the base holds out, by their poses, and else all (`not_held_out` says so). Raises SettingsError without photographs,
+    SceneError for a damaged one.
     """
     cameras = _judged(scene, base)
     if not cameras:
