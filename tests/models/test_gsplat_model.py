@@ -17,6 +17,7 @@ from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.formats.yaml_scalars import read_scalars
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.adapted_name import adapted_name
+from mipmap_plugin.models.adapted_scale import adapted_scale, adapted_viewer
 from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.wrap import wrap_model
 
@@ -133,6 +134,15 @@ def test_a_file_for_a_viewer_is_read_back_with_its_dilation(tmp_path, viewer, wr
     adapted = base.adapt(1 / 2, viewer=viewer, recipe="instant")
     trained = load_model(adapted.save(tmp_path / "out")).trained
     assert (trained.screen_filter, trained.eps2d) == ("mip", base.effects(viewer=viewer).eps2d)
+
+
+@pytest.mark.parametrize("write", [gsplat_folder, splatfacto_folder])
+def test_an_adapted_file_is_known_for_one_without_its_report(tmp_path, write):
+    """Its pictures at x1, to which it would be adapted again, are wrong."""
+    adapted = wrap_model(write(tmp_path / "r", splats()), cameras=tiny.cameras()).adapt(1 / 2, viewer="classic", recipe="instant")
+    file = adapted.save(tmp_path / "out")
+    file.with_name(f"{file.name}.adaptation.json").unlink()
+    assert (adapted_scale(file), adapted_viewer(file), adapted_scale(load_model(tmp_path / "r").source)) == (0.5, "classic", None)
 
 
 @pytest.mark.parametrize("target", ["out", "out.pt"])
