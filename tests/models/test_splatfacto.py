@@ -89,6 +89,15 @@ def test_a_folder_is_written_that_nerfstudio_finds_beside_the_old_one(tmp_path):
     assert equal(again, raw) and again.trained.screen_filter == "classic"
 
 
+def test_a_run_of_a_version_without_the_option_is_told_to_be_drawn_classic(tmp_path):
+    folder = splatfacto_folder(tmp_path / "r", splats())
+    config = folder / "config.yml"
+    config.write_text("".join(line for line in config.read_text().splitlines(keepends=True) if "rasterize_mode" not in line))
+    adapted = wrap_model(folder, cameras=tiny.cameras()).adapt(1 / 2, viewer="nerfstudio-antialiased", recipe="instant")
+    with pytest.warns(UserWarning, match="out: its config.yml is of a nerfstudio without rasterize_mode, which draws the splats classic, and not"):
+        adapted.save(tmp_path / "out")
+
+
 def test_colors_without_sh_come_back_as_the_same_colors(tmp_path):
     raw = splats(bands=0)
     raw["sh0"][0] = 12.0  # a color that float32 rounds to 1
