@@ -13,7 +13,6 @@ from mipmap_plugin.commands.common import print_json
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import JobsFailed, SettingsError, install, plural
-from mipmap_plugin.formats.atomic import named
 from mipmap_plugin.formats.here import from_here
 from mipmap_plugin.formats.staging import missing_folders, remove_empty
 from mipmap_plugin.jobs.base import Base
@@ -142,6 +141,8 @@ def _checkpoints(given: Sequence[Path]) -> list[Path]:
 
 def _of_scene(path: Path | None, checkpoint: Path) -> Path | None:
     """A path in which {name} stands for the checkpoint's name."""
+    from mipmap_plugin.formats.atomic import named
+
     place = named(checkpoint)
     name = place.stem if place.is_file() else place.name
     return path and Path(str(path).replace("{name}", name)).absolute()
