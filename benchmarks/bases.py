@@ -6,8 +6,9 @@ from pathlib import Path
 
 from mipmap_plugin import load_scene
 from mipmap_plugin.evaluation.evaluate import Evaluator
+from mipmap_plugin.evaluation.judged import photographed_views
 from mipmap_plugin.evaluation.perceptual import Perceptual
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, photographed_views
+from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.wrap import Wrapped
 

@@ -25,9 +25,10 @@ from rows import joined, write_table
 from mipmap_plugin import Camera, wrap_model
 from mipmap_plugin.adaptation.curve import decibel
 from mipmap_plugin.camera import evenly
+from mipmap_plugin.evaluation.judged import photographed_views
 from mipmap_plugin.evaluation.measure import RenderView
 from mipmap_plugin.evaluation.metrics import psnr
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, photographed_views
+from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.wrap import Wrapped
 
 VIEWERS, SCALES = ("spark", "playcanvas"), (2.0, 4.0)

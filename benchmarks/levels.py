@@ -34,8 +34,8 @@ from mipmap_plugin import load_model, load_scene, wrap_model
 from mipmap_plugin.adaptation.adapted import render_model
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.evaluation.judged import JudgedView, photographed_views
 from mipmap_plugin.evaluation.metrics import psnr
-from mipmap_plugin.evaluation.protocols import TestView, photographed_views
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.splat_transform import TOOL, find_tool
 from mipmap_plugin.levels.manifest import MANIFEST
@@ -97,7 +97,7 @@ class Change:
 class Dolly:
     """The frames' cameras and their truths."""
 
-    def __init__(self, base: Wrapped, views: Sequence[Camera], photographs: Sequence[TestView] = ()) -> None:
+    def __init__(self, base: Wrapped, views: Sequence[Camera], photographs: Sequence[JudgedView] = ()) -> None:
         """`photographs`: of all the views, in their order, or none."""
         self.base, self.views = base, views
         self._photographs = dict(zip(views, photographs, strict=bool(photographs)))

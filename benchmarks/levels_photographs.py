@@ -10,11 +10,11 @@ from PIL import Image
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.evaluation.judged import JudgedView
 from mipmap_plugin.evaluation.metrics import psnr
-from mipmap_plugin.evaluation.protocols import TestView
 
 
-def photograph(shot: TestView, frame: Camera) -> Tensor:
+def photograph(shot: JudgedView, frame: Camera) -> Tensor:
     """[h, w, 3]: what a photograph shows in a frame of any zoom of its view, shrunk by Pillow's bicubic on 8 bits, as in protocol P3.
 
     A frame has a whole number of pixels, so that it is up to a pixel wider than the photograph on each side. There the photograph's edge goes on.

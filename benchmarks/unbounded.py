@@ -29,8 +29,9 @@ from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.evaluation.evaluate import Evaluator, Row, adapted_row
+from mipmap_plugin.evaluation.judged import JudgedView
 from mipmap_plugin.evaluation.measure import RESIZED, RenderView, adapt_alone, baselines, resized_base, views_seen, warm_up
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TestView
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol
 from mipmap_plugin.evaluation.report import table
 from mipmap_plugin.evaluation.tradeoff.truth import EVALUATION_SEED
 from mipmap_plugin.formats.images import read_image
@@ -115,7 +116,7 @@ def judges(base: Wrapped, capture: Capture, name: str, scale: float, cameras: Se
     found: list[Evaluator] = [BaseEvaluator(views, protocol, scene=name) for protocol in ((AVERAGED, BICUBIC) if scale < 1 else (BICUBIC,))]
     if capture.photographs:
         files = [data / "images" / capture.photographs / f"{camera.name}.jpg" for camera in cameras]
-        photographs = [TestView(camera, read_image(file, base.background), file) for camera, file in zip(cameras, files, strict=True)]
+        photographs = [JudgedView(camera, read_image(file, base.background), file) for camera, file in zip(cameras, files, strict=True)]
         found.insert(0, Evaluator(photographs, PROTOCOLS["P3"], scene=name))
     return found
 

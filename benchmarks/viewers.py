@@ -25,8 +25,9 @@ from PIL import Image, ImageDraw
 from rows import earlier, joined
 
 from mipmap_plugin import wrap_model
+from mipmap_plugin.evaluation.judged import JudgedView, photographed_views
 from mipmap_plugin.evaluation.metrics import psnr
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, TestView, photographed_views
+from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.evaluation.report import markdown
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.wrap import Wrapped
@@ -145,7 +146,7 @@ def main(
 
 
 def rows_of_viewer(
-    browser: Browser, work: Work, base: str, viewer: str, files: Sequence[str], views: Sequence[TestView], pictures: Path
+    browser: Browser, work: Work, base: str, viewer: str, files: Sequence[str], views: Sequence[JudgedView], pictures: Path
 ) -> list[Row]:
     """Rows of every file in one viewer; the screenshots for the figure are written too."""
     rows = []
@@ -164,7 +165,7 @@ def rows_of_viewer(
     return rows
 
 
-def screenshots(opened: Page, work: Work, views: Sequence[TestView]) -> list[torch.Tensor]:
+def screenshots(opened: Page, work: Work, views: Sequence[JudgedView]) -> list[torch.Tensor]:
     pictures = opened.draw([view.camera.zoomed(work.scale) for view in views], work.base.background)
     return [torch.from_numpy(picture) for picture in pictures]
 

@@ -36,7 +36,8 @@ from mipmap_plugin.formats.atomic import named, refuse_output, refuse_unwritable
 from mipmap_plugin.formats.readers import refuse_unread
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_image, check_kinds, check_names, check_scale, path_of
-from mipmap_plugin.models.base import Filtered, SplatModel, TrainedScale, checked_splats, tensors_of, why_no_viewer
+from mipmap_plugin.models.base import Filtered, SplatModel, TrainedScale, tensors_of, why_no_viewer
+from mipmap_plugin.models.contract import checked_splats
 from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
 from mipmap_plugin.models.outputs import parts_of
 from mipmap_plugin.models.places import REPORT, state_path
@@ -127,8 +128,7 @@ class FrozenBase:
     ) -> Rendered:
         """Render the base model's view of `camera`, which samples `scale` times as finely as the training did.
 
-        `screen_filter`: as in `effects`. `supersampling`: samples per pixel along each axis. `options`: see `RenderOptions`. Raises
-        SettingsError.
+        `screen_filter`: as in `effects`. `supersampling`: samples per pixel along each axis. `options`: `RenderOptions`. Raises SettingsError.
         """
         [camera], outputs = checked([camera]), as_outputs(options.get("outputs"))
         check_names("render", options, RenderOptions, ("scale", "screen_filter", "supersampling"))

@@ -32,8 +32,8 @@ from mipmap_plugin.models.live import adopt
 from mipmap_plugin.process.threads import checked as checked_threads
 from mipmap_plugin.process.torch_modes import in_usual_modes
 from mipmap_plugin.scenes import Scene, load_scene
-from mipmap_plugin.scenes.cameras_json import WIDTH_CAP
 from mipmap_plugin.scenes.orbits import AXES
+from mipmap_plugin.scenes.training_options import WIDTH_CAP
 from mipmap_plugin.screen_filters import USUAL_EPS2D, check_screen_filter
 
 

@@ -27,9 +27,9 @@ from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_image, path_of
 from mipmap_plugin.models import contract, load_model
-from mipmap_plugin.models.base import SplatModel, checked_splats, digest_of_model, effects_of, tensors_of
+from mipmap_plugin.models.base import SplatModel, digest_of_model, effects_of, tensors_of
 from mipmap_plugin.models.exposure import exposed
-from mipmap_plugin.models.mip import for_loader_of, unread
+from mipmap_plugin.models.loaders import for_loader_of, unread
 from mipmap_plugin.models.outputs import cut_off, drawn_otherwise, parts_of, without_place
 from mipmap_plugin.models.places import REPORT, page_of
 from mipmap_plugin.plugin_errors import naming_any, unchanged
@@ -195,7 +195,7 @@ def render_model(
     matrix = model.traits.exposures.of(camera) if effects.exposure else None
     family = f"family {model.family!r}"
     with naming_any({family: model}), unchanged(family, tensors_of(model)):
-        gaussians = checked_splats(model, supersample.of_samples(camera, effects.supersampling))
+        gaussians = contract.checked_splats(model, supersample.of_samples(camera, effects.supersampling))
     gaussians = gaussians if form is None else form(gaussians)
     rendered = supersample.render(backend, gaussians, camera, effects, clamped=clamped)
     if effects.outputs:

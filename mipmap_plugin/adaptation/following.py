@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 from torch import Tensor
 
@@ -60,8 +60,8 @@ def follows(base: SplatModel) -> bool:
 
 def keep_rows(model: SplatModel, rows: Tensor) -> None:
     """Tell a model that keeps the results of its field that only these `rows` [M], ascending, are going to be left."""
-    if callable(keep := getattr(model, "keep_rows", None)):
-        keep(rows)
+    if follows(model):
+        cast(Any, model).keep_motions(rows)
 
 
 def release(model: SplatModel) -> None:

@@ -9,6 +9,7 @@ from mipmap_plugin.commands.ladders import Exports, print_summary, saved
 from mipmap_plugin.commands.outputs import folder_of_several
 from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, Scale, ScreenFilter, Seed, Threads, Up, Viewer, Way
 from mipmap_plugin.config import ViewPolicy
+from mipmap_plugin.formats.atomic import named
 from mipmap_plugin.formats.splat_transform import WRITTEN
 from mipmap_plugin.jobs.base import Base
 
@@ -62,7 +63,7 @@ def levels(
     """
     from mipmap_plugin.levels.request import LadderRequest
 
-    exports = Exports(streamed_sog, tiles, canvas, checkpoint.resolve().name if report else None)
+    exports = Exports(streamed_sog, tiles, canvas, named(checkpoint).name if report else None)
     exports.check(folder_of_several(output, (".ply", *WRITTEN, ".json")))
     request = LadderRequest(viewer, coarsest, ratio, least_db, until_splats, recipe, {"seed": seed, **without_none(views=views, steps=steps)}, by)
     base = Base(checkpoint, cameras, background, backend, screen_filter, up)

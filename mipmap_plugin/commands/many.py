@@ -141,7 +141,9 @@ def _checkpoints(given: Sequence[Path]) -> list[Path]:
 
 def _of_scene(path: Path | None, checkpoint: Path) -> Path | None:
     """A path in which {name} stands for the checkpoint's name."""
-    place = checkpoint.resolve()
+    from mipmap_plugin.formats.atomic import named
+
+    place = named(checkpoint)
     name = place.stem if place.is_file() else place.name
     return path and Path(str(path).replace("{name}", name)).absolute()
 

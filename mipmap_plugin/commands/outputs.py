@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.formats.atomic import absolute
 from mipmap_plugin.formats.splat_transform import WRITTEN
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ def adapted_path(checkpoint: Path, output: Path | None, scale: float, viewer: st
 
     name = adapted_name(checkpoint, scale, viewer)
     if output is None:
-        return checkpoint.resolve().parent / name
+        return absolute(checkpoint).parent / name
     return folder_of_several(output, (".ply", *WRITTEN)) / name if several else output
 
 

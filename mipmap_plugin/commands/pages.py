@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import this_command
-from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
+from mipmap_plugin.formats.atomic import named, refuse_output, refuse_unwritable
 from mipmap_plugin.formats.here import from_here
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def write_evaluation_page(
     from mipmap_plugin.pages.html import write_page
     from mipmap_plugin.pages.reports import evaluation_page
 
-    title = ", ".join(each.resolve().name for each in checkpoints)
+    title = ", ".join(named(each).name for each in checkpoints)
     write_page(page, evaluation_page(title, galleries, rows, commands=(this_command(),), notes=notes), overwrite)
 
 
@@ -53,7 +53,7 @@ class AdaptationPage:
         """Raises now the errors that writing the page would raise: OutputExists and OutputError."""
         from mipmap_plugin.models.places import PAGE_ENDING
 
-        name = checkpoint.resolve().name
+        name = named(checkpoint).name
         folder, self.of_one = targets[0].resolve().parent, len(targets) == 1
         self.path = folder / f"{targets[0].resolve().name if self.of_one else f'{name}_adapted'}{PAGE_ENDING}"
         self._title, self._overwrite, self._zooms = name, overwrite, list[Any]()
@@ -89,7 +89,7 @@ def write_tradeoff_page(page: Path, checkpoint: Path, base: Wrapped, overwrite: 
     from mipmap_plugin.pages.html import write_page
     from mipmap_plugin.pages.reports import tradeoff_page
 
-    title = f"{checkpoint.resolve().name}: accuracy and time"
+    title = f"{named(checkpoint).name}: accuracy and time"
     write_page(page, tradeoff_page(title, base, facts(tradeoffs, complete=True), (this_command(),)), overwrite)
 
 

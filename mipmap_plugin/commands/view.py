@@ -17,7 +17,7 @@ from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, ScreenFilter, Up, Viewer
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.formats.atomic import refuse_unwritable
+from mipmap_plugin.formats.atomic import named, refuse_unwritable
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.progress import announced
 
@@ -69,7 +69,7 @@ def view(
     if viewer is not None:
         wrapped.target(viewer)  # raises before any work
     with all_threads.limited(threads, shared=False):
-        name = checkpoint.resolve().name
+        name = named(checkpoint).name
         page = _page(wrapped, adapted, backend, PageSettings(host, port, name, *_choices(wrapped, viewer), _free(checkpoint, output)))
         try:
             taken = "" if port == 0 or page.address.endswith(f":{port}") else f" (port {port} is taken)"

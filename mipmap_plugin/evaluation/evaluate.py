@@ -16,6 +16,7 @@ from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError, some_of, unknown, warn
 from mipmap_plugin.evaluation.cells import Cells, made_by
+from mipmap_plugin.evaluation.judged import not_held_out, photographed_views
 from mipmap_plugin.evaluation.measure import (
     FILTERS,
     Baseline,
@@ -31,7 +32,7 @@ from mipmap_plugin.evaluation.metrics import psnr, ssim
 from mipmap_plugin.evaluation.other_scene import of_another_scene, of_another_size
 from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.photographs import digest_of_image
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, not_held_out, photographed_views
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView
 from mipmap_plugin.evaluation.shots import Recorder, Shot, Watcher
 from mipmap_plugin.progress import Bar
 from mipmap_plugin.recipes import most_steps

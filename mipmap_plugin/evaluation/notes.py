@@ -7,8 +7,9 @@ from itertools import product
 from typing import Any
 
 from mipmap_plugin.evaluation.evaluate import Evaluator, config_of
+from mipmap_plugin.evaluation.judged import not_exposed
 from mipmap_plugin.evaluation.measure import FILTERS
-from mipmap_plugin.evaluation.protocols import Protocol, not_exposed
+from mipmap_plugin.evaluation.protocols import Protocol
 from mipmap_plugin.models.base import SplatModel, effects_of
 from mipmap_plugin.recipes import most_steps
 from mipmap_plugin.wrap import Wrapped

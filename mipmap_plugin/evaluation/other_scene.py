@@ -6,10 +6,11 @@ from collections.abc import Sequence
 
 from mipmap_plugin.adaptation.target.other_world import doubt_about
 from mipmap_plugin.adaptation.target.photographs import names_of
-from mipmap_plugin.evaluation.protocols import Protocol, TestView, TruthView
+from mipmap_plugin.evaluation.judged import JudgedView
+from mipmap_plugin.evaluation.protocols import Protocol, TruthView
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.scenes import Scene
-from mipmap_plugin.scenes.cameras_json import photographs_folder, trained_size
+from mipmap_plugin.scenes.training_options import photographs_folder, trained_size
 from mipmap_plugin.wrap import Wrapped
 
 # px: a size that was rounded in other ways is no other size.
@@ -19,7 +20,7 @@ ROUNDING = 4
 def of_another_scene(model: Wrapped, views: Sequence[TruthView], scale: float, protocol: Protocol) -> str:
     """That the base does not show what the photographs do, in a sentence (`doubt_about`); "" if it does."""
     truths = {view.camera: view for view in views}
-    masks = ", whose transparent parts count as background" if any(isinstance(view, TestView) and view.transparent for view in views) else ""
+    masks = ", whose transparent parts count as background" if any(isinstance(view, JudgedView) and view.transparent for view in views) else ""
     return doubt_about([*truths], lambda camera: truths[camera].truth(scale, protocol), model.render, model.background, f"--images{masks}")
 
 

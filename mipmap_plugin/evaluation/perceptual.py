@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError, install
+from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError, brief, install
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.process.torchvision_absent import torchvision_optional
 from mipmap_plugin.progress import announced
@@ -25,6 +25,8 @@ DOWNLOADS = {
     "alex": "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
     "vgg": "https://download.pytorch.org/models/vgg16-397923af.pth",
 }
+
+AGAIN = "remove it, so that it is downloaded again"
 
 # px: a smaller image is less than one pixel after the last pooling.
 SMALLEST = {"alex": 31, "vgg": 16}
@@ -69,7 +71,8 @@ def _load(backbone: str, file: Path | None) -> nn.Module:
     try:
         network.net.load_state_dict({name: weights[torchvision_name] for name, torchvision_name in torchvision_names.items()})
     except (KeyError, TypeError, RuntimeError) as error:
-        raise CheckpointError(f"{file} holds no {backbone} backbone as torchvision saves it; leave it out to download one") from error
+        where, advice = (file, "leave it out to download one") if file else (_kept(backbone), AGAIN)
+        raise CheckpointError(f"{where} holds no {backbone} backbone as torchvision saves it; {advice}") from error
     measure: nn.Module = network
     return measure
 
@@ -81,6 +84,13 @@ def _download(backbone: str) -> dict[str, Tensor]:
     except OSError as error:
         advice = f"download {DOWNLOADS[backbone]} elsewhere and give the file (--lpips-weights)"
         raise SettingsError(f"LPIPS needs the weights of its backbone, which cannot be downloaded ({error}); {advice}") from error
+    except Exception as error:  # what torch raises for a file of an earlier download that is not whole
+        raise CheckpointError(f"{_kept(backbone)} is damaged ({brief(error)}); {AGAIN}") from error
+
+
+def _kept(backbone: str) -> Path:
+    """Where torch keeps the weights that it downloads."""
+    return Path(torch.hub.get_dir(), "checkpoints", Path(DOWNLOADS[backbone]).name)
 
 
 def _alexnet(pretrained: bool) -> SimpleNamespace:

@@ -27,14 +27,14 @@ def viewer_differences(wrapped: Wrapped) -> str:
     Both images are rendered by this package: the viewer's with its convention (`splatting.viewers`), the truth with that of the training.
     """
     model, scale = wrapped.model, adapted_scale(wrapped.model.source) or 1.0
-    views = [view.zoomed(scale) for view in wrapped.views()]
-    count, pixels = len(model.gaussians(views[0])), views[0].width * views[0].height
     if reason := why_no_viewer(model):
         return f"not drawn: {reason}"
     if model.traits.placed:
         return "not drawn: its own project alone opens such a file; `mipmap-plugin adapt --scale 1 --viewer NAME --output NEW.ply` makes another"
     if "reference" in (wrapped.backend()[0].name, wrapped.backend(viewer=VIEWERS[0])[0].name):
         return "not drawn: only the reference backend can, which takes too long; `mipmap-plugin backends` says what others lack"
+    views = [view.zoomed(scale) for view in wrapped.views()]
+    count, pixels = len(model.gaussians(views[0])), views[0].width * views[0].height
     view_count = min(VIEWS, len(views), SPLATS // max(1, count), PIXELS // pixels)
     if view_count == 0:
         return f"not drawn: {plural(count, 'splat')} on {plural(pixels, 'pixel')} take too long; `mipmap-plugin render --viewer NAME` draws them"

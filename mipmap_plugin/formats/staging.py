@@ -179,7 +179,7 @@ def _locked(lock: int, made: bool) -> bool:
     except BlockingIOError:
         return False
     except OSError:
-        return made or _is_stale(os.fstat(lock))
+        return made or time.time() - os.fstat(lock).st_mtime > STALE_S
     return True
 
 
@@ -198,10 +198,6 @@ def _is_of(lock: int, folder: Path) -> bool:
         return stat.S_ISREG(os.fstat(lock).st_mode) or os.path.samestat(os.fstat(lock), os.stat(folder))
     except FileNotFoundError:
         return False
-
-
-def _is_stale(folder: os.stat_result) -> bool:
-    return time.time() - folder.st_mtime > STALE_S
 
 
 def _moved_at_once(made: Path, target: Path) -> bool:

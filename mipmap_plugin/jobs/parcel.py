@@ -148,7 +148,7 @@ def _photographs(path: Path, folder: Path) -> dict[Path, Path]:
 
 
 def _packed(path: Path, folder: Path) -> Path:
-    """Where a scene is in the archive. The name of the folder above is kept, for it says which capture of HyperNeRF it is (`scenes.moving`)."""
+    """Where a scene is in the archive. The name of the folder above is kept, for it says which capture of HyperNeRF it is (`scenes.hypernerf`)."""
     return folder / path.name if path.is_file() else folder / path.absolute().parent.name / "scene"
 
 

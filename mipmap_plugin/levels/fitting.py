@@ -20,7 +20,7 @@ from mipmap_plugin.formats.splat_transform import WRITTEN
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.models import contract
 from mipmap_plugin.models.base import SplatModel, digest_of_model
-from mipmap_plugin.models.mip import for_loader_of, wants_filter
+from mipmap_plugin.models.loaders import for_loader_of, wants_filter
 from mipmap_plugin.recipes import recipe, scale_of_fraction
 from mipmap_plugin.splatting.viewers import degree_for
 

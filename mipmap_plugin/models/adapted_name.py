@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mipmap_plugin.errors import MipmapPluginError
+from mipmap_plugin.formats.atomic import named
 from mipmap_plugin.formats.readers import READ_GLB
 from mipmap_plugin.formats.splat_transform import EXCHANGE, READ_ONLY, WRITTEN
 from mipmap_plugin.models.detect import detect
@@ -21,13 +22,13 @@ OWN_VIEWERS = ("gsplat", "gsplat-antialiased", "nerfstudio", "nerfstudio-antiali
 
 
 def adapted_name(checkpoint: Path, scale: float, viewer: str | None = None) -> str:
-    """NAME_x0.25 or NAME_x0.25_spark, with the ending of what is saved; none for a folder.
+    """NAME_x0.25 or NAME_x0.25_spark, with the ending of what is saved; none for a folder. NAME is that of a link, not of what it leads to.
 
     Exchange formats that can only be read, or have another ending, are written as a PLY, as is a PLY in a zip archive. glTF is written as .glb, but
     as a PLY for a viewer that does not read that, and files of third-party families as these say (`Family.saves`), but as a PLY for any. What gsplat
     and nerfstudio save becomes a folder of theirs, but a PLY for a viewer of others.
     """
-    name = checkpoint.resolve().name
+    name = named(checkpoint).name
     read, written = _endings(checkpoint, name, viewer)
     return f"{name[: len(name) - len(read)]}_x{scale:g}{f'_{viewer}' if viewer else ''}{written}"
 

@@ -7,9 +7,9 @@ from typing import Any
 
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.json_file import read_json
-from mipmap_plugin.formats.magic import kind_of
+from mipmap_plugin.formats.magic import kind_of, pickle_of, texts_in
 from mipmap_plugin.formats.ply import read_header
-from mipmap_plugin.formats.tags import provenance_of, vertical_of
+from mipmap_plugin.formats.tags import PROVENANCE, provenance_of, vertical_of
 from mipmap_plugin.formats.yaml_scalars import read_scalars
 from mipmap_plugin.models.places import REPORT, has_report
 
@@ -82,8 +82,11 @@ def _record(source: Path | None) -> dict[str, Any]:
 
 
 def _comments(source: Path | None) -> tuple[str, ...]:
-    """The comments of a PLY's header; () of anything else. Raises CheckpointError for a damaged file."""
-    return read_header(source).comments if source is not None and source.is_file() and kind_of(source) == "ply" else ()
+    """The comments of a PLY's header, or that of this package in a torch file; () of anything else. Raises CheckpointError for a damaged file."""
+    kind = kind_of(source) if source is not None and source.is_file() else ""
+    if source is None or kind not in ("ply", "torch"):
+        return ()
+    return read_header(source).comments if kind == "ply" else texts_in(pickle_of(source), PROVENANCE)
 
 
 def refuse_adapted(source: Path | None) -> None:

@@ -13,11 +13,9 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import NEAR_PLANE, Effect, Effects
-from mipmap_plugin.errors import PluginError, ShapeError, type_of
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
 from mipmap_plugin.models.hosts import Capture
-from mipmap_plugin.plugin_errors import is_third_party
 from mipmap_plugin.screen_filters import DILATION
 
 # Name, among a model's parameters, of values that are never optimized but removed with their rows, such as an anchor's level.
@@ -28,12 +26,6 @@ SPLATS = "splats"
 
 # Names of effects of models.
 TIME, BY_VIEW = "time", "view-dependent geometry"
-
-# By which the activation of a third-party family may leave 0..1.
-OPACITY_ROUNDING = 1e-4
-
-# By how much of its largest entry a third-party family's covariance may lack symmetry, or a variance be below 0.
-COVARIANCE_ROUNDING = 1e-3
 
 
 @dataclass(frozen=True)
@@ -214,41 +206,6 @@ def why_no_viewer(model: SplatModel) -> str:
     if not traits.same_for_all_views:
         return "its splats differ from view to view or in time, and a viewer's file holds them once and for all"
     return "it says that its files are for its own project alone" if model.trained.keeps_filter else ""
-
-
-def checked_splats(model: SplatModel, camera: Camera) -> Gaussians:
-    """The splats that a camera sees. Raises PluginError if a third-party family returns something else, or splats that no image can show."""
-    if not is_third_party(model):
-        return model.gaussians(camera)
-    try:
-        gaussians: Any = model.gaussians(camera)
-    except ShapeError as error:  # of the record that it makes
-        raise PluginError(f"family {model.family!r}: gaussians() returned splats that do not fit together: {error}") from error
-    if not isinstance(gaussians, Gaussians):
-        raise PluginError(f"family {model.family!r}: gaussians() has to return Gaussians; it returned {type_of(gaussians)}")
-    tensors = {name: tensor for name, tensor in vars(gaussians).items() if isinstance(tensor, Tensor)}
-    if wrong := [name for name, tensor in tensors.items() if not tensor.isfinite().all()]:
-        raise PluginError(f"family {model.family!r}: gaussians() returned NaN or infinity in {', '.join(wrong)}; leave such splats out while loading")
-    least, most = gaussians.opacities.detach().aminmax() if len(gaussians) else (0.0, 0.0)
-    if least < -OPACITY_ROUNDING or most > 1 + OPACITY_ROUNDING:
-        outside = f"opacities from {float(least):.3g} to {float(most):.3g}"
-        raise PluginError(f"family {model.family!r}: gaussians() returned {outside}, which have to lie in 0..1; activate or clamp them")
-    if shapeless := _no_shapes(gaussians):
-        raise PluginError(f"family {model.family!r}: gaussians() returned {shapeless}")
-    return gaussians
-
-
-@torch.no_grad()
-def _no_shapes(gaussians: Gaussians) -> str:
-    """Why scales are no lengths, or covariances are none, and what to do; empty if they are."""
-    if gaussians.covariances is None:
-        negative = bool((gaussians.scales < 0).any())
-        return "negative scales, which have to be lengths; activate them by exp(), or take abs()" if negative else ""
-    slack = COVARIANCE_ROUNDING * gaussians.covariances.abs().amax((1, 2), keepdim=True)
-    if ((gaussians.covariances - gaussians.covariances.mT).abs() > slack).any():
-        return "covariances that are not symmetric; of a factor L give L @ L.mT"
-    negative = bool((gaussians.covariances.diagonal(dim1=1, dim2=2) < -slack[:, :, 0]).any())
-    return "covariances with negative variances on the diagonal; check their signs and the order of their numbers" if negative else ""
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""What third-party families promise, looked at before anything relies on it; what they break is a PluginError that names the family."""
+"""Whether third-party families keep the contract of a model (`base`), before anything relies on it; a breach is a PluginError that names them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import CheckpointError, PluginError, type_of
+from mipmap_plugin.errors import CheckpointError, PluginError, ShapeError, type_of
 from mipmap_plugin.formats.atomic import staged
 from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.gaussians import Gaussians
@@ -27,7 +27,6 @@ from mipmap_plugin.models.base import (
     Thinned,
     TrainedScale,
     Traits,
-    checked_splats,
     tensors_of,
 )
 from mipmap_plugin.models.detect import detect
@@ -42,6 +41,12 @@ TYPES: dict[str, tuple[type, ...]] = {
     "traits": (Traits,), "family": (str,), "trained": (TrainedScale,), "notes": (list,), "source": (Path, NoneType), "folder": (Path, NoneType),
     "digest": (str,),
 }  # fmt: skip
+
+# By which the activation of a third-party family may leave 0..1.
+OPACITY_ROUNDING = 1e-4
+
+# By how much of its largest entry a third-party family's covariance may lack symmetry, or a variance be below 0.
+COVARIANCE_ROUNDING = 1e-3
 
 # Types of files by the endings that third-party families may write beside their own.
 ENDINGS = {".ply": "ply", ".spz": "spz", ".sog": "sog"}
@@ -116,6 +121,41 @@ def refuse_broken(model: SplatModel, camera: Camera, *, steps: bool) -> None:
     if steps:
         with naming(family):
             _refuse_gradients(family, copied, camera)
+
+
+def checked_splats(model: SplatModel, camera: Camera) -> Gaussians:
+    """The splats that a camera sees. Raises PluginError if a third-party family returns something else, or splats that no image can show."""
+    if not is_third_party(model):
+        return model.gaussians(camera)
+    try:
+        gaussians: Any = model.gaussians(camera)
+    except ShapeError as error:  # of the record that it makes
+        raise PluginError(f"family {model.family!r}: gaussians() returned splats that do not fit together: {error}") from error
+    if not isinstance(gaussians, Gaussians):
+        raise PluginError(f"family {model.family!r}: gaussians() has to return Gaussians; it returned {type_of(gaussians)}")
+    tensors = {name: tensor for name, tensor in vars(gaussians).items() if isinstance(tensor, Tensor)}
+    if wrong := [name for name, tensor in tensors.items() if not tensor.isfinite().all()]:
+        raise PluginError(f"family {model.family!r}: gaussians() returned NaN or infinity in {', '.join(wrong)}; leave such splats out while loading")
+    least, most = gaussians.opacities.detach().aminmax() if len(gaussians) else (0.0, 0.0)
+    if least < -OPACITY_ROUNDING or most > 1 + OPACITY_ROUNDING:
+        outside = f"opacities from {float(least):.3g} to {float(most):.3g}"
+        raise PluginError(f"family {model.family!r}: gaussians() returned {outside}, which have to lie in 0..1; activate or clamp them")
+    if shapeless := _no_shapes(gaussians):
+        raise PluginError(f"family {model.family!r}: gaussians() returned {shapeless}")
+    return gaussians
+
+
+@torch.no_grad()
+def _no_shapes(gaussians: Gaussians) -> str:
+    """Why scales are no lengths, or covariances are none, and what to do; empty if they are."""
+    if gaussians.covariances is None:
+        negative = bool((gaussians.scales < 0).any())
+        return "negative scales, which have to be lengths; activate them by exp(), or take abs()" if negative else ""
+    slack = COVARIANCE_ROUNDING * gaussians.covariances.abs().amax((1, 2), keepdim=True)
+    if ((gaussians.covariances - gaussians.covariances.mT).abs() > slack).any():
+        return "covariances that are not symmetric; of a factor L give L @ L.mT"
+    negative = bool((gaussians.covariances.diagonal(dim1=1, dim2=2) < -slack[:, :, 0]).any())
+    return "covariances with negative variances on the diagonal; check their signs and the order of their numbers" if negative else ""
 
 
 def _refuse_gradients(family: str, copied: SplatModel, camera: Camera) -> None:

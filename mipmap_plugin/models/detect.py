@@ -161,8 +161,8 @@ def _why_not(files: Files) -> str:
 def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
     if (folder / "point_cloud").is_dir():
         return _detect_iteration(folder, iteration)
-    for family, steps in _placed(folder):
-        return _detect_step(family, folder, steps, iteration)
+    if placed := next(_placed(folder), None):
+        return _detect_step(*placed, folder, iteration)
     if iteration is not None:
         raise CheckpointError(f"{folder} has no point_cloud/iteration_{iteration}; give the model folder above it, or no iteration")
     files = sorted(folder.iterdir())
@@ -277,7 +277,7 @@ def _steps(folder: Path, family: Family, below: str, pattern: str) -> dict[int, 
     return {step: file for step, file in named.items() if family.recognize(Files(file))}
 
 
-def _detect_step(family: Family, folder: Path, steps: dict[int, Path], wanted: int | None) -> Checkpoint:
+def _detect_step(family: Family, steps: dict[int, Path], folder: Path, wanted: int | None) -> Checkpoint:
     step = max(steps) if wanted is None else wanted
     if step not in steps:
         raise CheckpointError(f"{folder} has no checkpoint of step {step}; it has {', '.join(map(str, sorted(steps)))}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 from mipmap_plugin.errors import PluginError, with_article
 from mipmap_plugin.formats.splat_transform import EXCHANGE
@@ -25,11 +26,12 @@ GRUT = ("features_albedo", "density")
 ANCHOR_COLUMNS = {"f_offset_0", "f_anchor_feat_0"}
 FILTERED = ("mip", "gof", "analytic")
 FLAT_OR_FILTERED = (*FILTERED, "2dgs")
+OF_MORE_COLUMNS = ("sc-gs", *FLAT_OR_FILTERED)
 
 
-def where(test: Callable[[Files], object], why: str, trouble: str = "", *, sure: float = CERTAIN) -> Recognize:
-    """Recognize files that pass `test`. `trouble` is formatted with the path."""
-    return lambda files: Match(sure, why, trouble.format(path=files.path)) if test(files) else None
+def where(test: Callable[[Files], object], why: str, *, sure: float = CERTAIN) -> Recognize:
+    """Recognize files that pass `test`."""
+    return lambda files: Match(sure, why) if test(files) else None
 
 
 def anchors(name: str) -> Recognize:
@@ -112,6 +114,12 @@ def _lost_network(files: Files, family: str) -> Match | None:
 family = partial(Family, api_version=API_VERSION)
 LOADERS = "mipmap_plugin.models"
 
+
+def refused(name: str, title: str, test: Callable[[Files], object], why: str, trouble: str, *, sure: float = CERTAIN, **facts: Any) -> Family:
+    """A family whose files, which pass `test`, are refused in a sentence: their path and `trouble`. `facts`: further ones of `Family`."""
+    return family(name, title, lambda files: Match(sure, why, f"{files.path} {trouble}") if test(files) else None, **facts)
+
+
 BUILT_IN = (
     family(
         "3dgs", "3D Gaussian splatting", where(lambda files: files.holds_splats, "columns of splats", sure=PLAIN),
@@ -154,68 +162,47 @@ BUILT_IN = (
         "hac", "HAC", anchors("hac"), before=FLAT_OR_FILTERED,
         not_loaded=": its networks and grids lie in checkpoint.pth (HAC++, ContextGS and others store theirs so too)",
     ),
-    family(
-        "spacetime", "SpacetimeGaussians", where(lambda files: "trbf_center" in files.columns, "columns trbf_center"),
-        before=("sc-gs", *FLAT_OR_FILTERED),
-    ),
+    family("spacetime", "SpacetimeGaussians", where(lambda files: "trbf_center" in files.columns, "columns trbf_center"), before=OF_MORE_COLUMNS),
     family("sc-gs", "SC-GS", controlled, before=FLAT_OR_FILTERED),
-    family(
-        "many-scales", "another model", where(
-            lambda files: "scale_3" in files.columns and not ANCHOR_COLUMNS & files.columns, "column scale_3",
-            "{path} has the column scale_3, which no splats have: it holds anchors or another model; give what it exports",
-        ),
-        before=("spacetime", "sc-gs", *FLAT_OR_FILTERED),
+    refused(
+        "many-scales", "another model", lambda files: "scale_3" in files.columns and not ANCHOR_COLUMNS & files.columns, "column scale_3",
+        "has the column scale_3, which no splats have: it holds anchors or another model; give what it exports",
+        before=("spacetime", *OF_MORE_COLUMNS),
     ),
-    family(
-        "3d-hgs", "3D-HGS", where(
-            lambda files: {"opacity1", "opacity2"} <= files.columns, "columns opacity1, opacity2",
-            "{path} holds half-Gaussians (3D-HGS), whose two halves have opacities of their own, which are not read here",
-        ),
-        before=("many-scales", "spacetime", "sc-gs", *FLAT_OR_FILTERED),
+    refused(
+        "3d-hgs", "3D-HGS", lambda files: {"opacity1", "opacity2"} <= files.columns, "columns opacity1, opacity2",
+        "holds half-Gaussians (3D-HGS), whose two halves have opacities of their own, which are not read here",
+        before=("many-scales", "spacetime", *OF_MORE_COLUMNS),
     ),
-    family(
-        "saga", "SAGA", where(
-            lambda files: {"f_0", "opacity"} <= files.columns and "f_dc_0" not in files.columns, "features without colors",
-            "{path} holds features without colors (SAGA); give the scene_point_cloud.ply of its training",
-        ),
-        before=("spacetime", "sc-gs", *FLAT_OR_FILTERED),
+    refused(
+        "saga", "SAGA", lambda files: {"f_0", "opacity"} <= files.columns and "f_dc_0" not in files.columns, "features without colors",
+        "holds features without colors (SAGA); give the scene_point_cloud.ply of its training",
+        before=("spacetime", *OF_MORE_COLUMNS),
     ),
-    family(
-        "gsplat-png", "gsplat's PngCompression", where(
-            lambda files: files.kind == "gsplat-png", "a meta.json of pictures",
-            "{path} lists the pictures of gsplat's PngCompression, which are quantized; give the ckpts/ckpt_*.pt that they were made from",
-        ),
+    refused(
+        "gsplat-png", "gsplat's PngCompression", lambda files: files.kind == "gsplat-png", "a meta.json of pictures",
+        "lists the pictures of gsplat's PngCompression, which are quantized; give the ckpts/ckpt_*.pt that they were made from",
         place=("", r"meta\.json"),
     ),
-    family(
-        "beta", "Deformable Beta Splatting", where(
-            lambda files: {"beta", "sh0_0"} <= files.columns, "columns beta, sh0_0",
-            "{path} is of Deformable Beta Splatting, whose kernels are no Gaussians, which is not read here",
-        ),
+    refused(
+        "beta", "Deformable Beta Splatting", lambda files: {"beta", "sh0_0"} <= files.columns, "columns beta, sh0_0",
+        "is of Deformable Beta Splatting, whose kernels are no Gaussians, which is not read here",
     ),
-    family(
-        "3dgrut", "3DGRUT", where(
-            lambda files: files.words(*GRUT) == set(GRUT), "its parameters' names",
-            "{path} is of 3DGRUT, whose checkpoints are not read here; give the PLY that it exports (export_ply.enabled=true)",
-        ),
+    refused(
+        "3dgrut", "3DGRUT", lambda files: files.words(*GRUT) == set(GRUT), "its parameters' names",
+        "is of 3DGRUT, whose checkpoints are not read here; give the PLY that it exports (export_ply.enabled=true)",
     ),
-    family(
-        "fudan", "4D Gaussian Splatting (fudan-zvg)", where(
-            lambda files: files.words(*FUDAN) == set(FUDAN), "its optimizer's names",
-            "{path} is of 4D Gaussian Splatting (fudan-zvg), whose splats have a time of their own, which is not read here", sure=BY_COMPANIONS,
-        ),
+    refused(
+        "fudan", "4D Gaussian Splatting (fudan-zvg)", lambda files: files.words(*FUDAN) == set(FUDAN), "its optimizer's names",
+        "is of 4D Gaussian Splatting (fudan-zvg), whose splats have a time of their own, which is not read here", sure=BY_COMPANIONS,
     ),
-    family(
-        "training", "a training run", where(
-            lambda files: files.words("param_groups"), "holds param_groups",
-            "{path} is the state of a training run; give the point_cloud.ply or the model folder that was saved beside it", sure=0.3,
-        ),
+    refused(
+        "training", "a training run", lambda files: files.words("param_groups"), "holds param_groups",
+        "is the state of a training run; give the point_cloud.ply or the model folder that was saved beside it", sure=0.3,
     ),
-    family(
-        "network", "a deformation network", where(
-            lambda files: files.words("linear.0.weight", "nodes", "deformation_net"), "holds linear.0.weight",
-            "{path} is a deformation network without its splats; give the model folder that holds both", sure=0.2,
-        ),
+    refused(
+        "network", "a deformation network", lambda files: files.words("linear.0.weight", "nodes", "deformation_net"), "holds linear.0.weight",
+        "is a deformation network without its splats; give the model folder that holds both", sure=0.2,
     ),
 )  # fmt: skip
 

@@ -16,8 +16,8 @@ from mipmap_plugin.models import splatfacto
 from mipmap_plugin.models.anchors.companions import NEEDED
 from mipmap_plugin.models.anchors.networks import Weights
 from mipmap_plugin.models.anchors.scaffold import scaffold_in_memory
-from mipmap_plugin.models.base import CARRIED, OPACITY_ROUNDING, SplatModel, TrainedScale, tensors_of
-from mipmap_plugin.models.contract import lacking
+from mipmap_plugin.models.base import CARRIED, SplatModel, TrainedScale, tensors_of
+from mipmap_plugin.models.contract import OPACITY_ROUNDING, lacking
 from mipmap_plugin.models.gsplat import model as gsplat
 from mipmap_plugin.models.health import holds_splats, rows_where
 from mipmap_plugin.models.reading import without_invalid

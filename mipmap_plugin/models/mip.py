@@ -12,23 +12,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import NEAR_PLANE, Effect
 from mipmap_plugin.errors import CheckpointError, ShapeError, plural, some_of
-from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import CARRIED, SplatModel, TrainedScale, Traits
+from mipmap_plugin.models.base import CARRIED, TrainedScale, Traits
 from mipmap_plugin.models.columns import FILTER_3D as COLUMN
 from mipmap_plugin.models.detect import detect_as
 from mipmap_plugin.models.health import LARGEST
 from mipmap_plugin.models.outputs import finite
 from mipmap_plugin.models.reading import drop, read_splats
 from mipmap_plugin.models.vanilla import VanillaModel
-from mipmap_plugin.splatting.viewers import degree_for, find_viewer, reads_extra_columns, viewers_for
 
 # Screen filter of each family, and its dilation in px² if no cfg_args gives the kernel_size.
 FAMILY_FILTERS = {"mip": ("mip", 0.1), "gof": ("mip", 0.0), "analytic": ("analytic", 0.0)}
@@ -171,36 +168,6 @@ def load_mip(path: str | Path, *, iteration: int | None = None) -> MipModel:
     splats.trained = _trained(checkpoint.family, splats.trained)
     splats.notes += NOTES[checkpoint.family]
     return MipModel(checkpoint.family, splats, filter_3d)
-
-
-def for_loader_of(viewer: str | None, model: SplatModel, path: Path) -> SplatModel:
-    """The model as the viewer that it is made for loads it from `path`.
-
-    Mip-Splatting's loader requires the column filter_3D. It is 0: the splats of a file for a viewer are smoothed as far as they have to be. Other
-    loaders read PLYs of some SH degrees only (`Viewer.read_degrees`), or without further columns.
-    """
-    if is_written(path) or not isinstance(model, VanillaModel):
-        return model
-    degree = degree_for(viewer, model.sh_degree)
-    if degree != model.sh_degree and (path.suffix.lower() == ".ply" or not model.traits.placed):
-        model = model.with_degree(degree)
-    if model.extras and not reads_extra_columns(viewer):
-        model = model.with_extras({})
-    return model.with_extras({**model.extras, COLUMN: np.zeros(len(model), dtype=np.float32)}) if wants_filter(viewer) else model
-
-
-def unread(viewer: str | None, model: SplatModel, path: Path) -> str:
-    """What the file at `path` is without, for the loader of the viewer does not read it, in a sentence; "" if it has everything."""
-    written = for_loader_of(viewer, model, path)
-    degree, read = (getattr(each, "sh_degree", 0) for each in (model, written))
-    extras = ", ".join(name for name in getattr(model, "extras", ()) if name not in getattr(written, "extras", ()))
-    lost = ([f"SH bands above degree {read}"] if read < degree else []) + ([f"the extra columns {extras}"] if extras else [])
-    return f"{' and '.join(lost)} are left out, which loaders of {viewer} do not read right" if lost else ""
-
-
-def wants_filter(viewer: str | None) -> bool:
-    """Whether the viewer, or each of a group, reads the column filter_3D."""
-    return viewer is not None and all(find_viewer(name).filter_3d for name in viewers_for(viewer))
 
 
 def smooth_3d(scales: Tensor, opacities: Tensor, filter_3d: Tensor) -> tuple[Tensor, Tensor]:

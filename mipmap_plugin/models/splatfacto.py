@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import CheckpointError, OutputError, SceneError, ShapeError
+from mipmap_plugin.errors import CheckpointError, OutputError, SceneError, ShapeError, warn
 from mipmap_plugin.formats.atomic import new_folder, sha256
 from mipmap_plugin.formats.tags import render_mode
 from mipmap_plugin.formats.torch_file import load_torch, save_torch, step_and_comments
@@ -125,6 +125,8 @@ class SplatfactoHost:
         """Copy the config and the transforms. The config refers to its folder by name, as `timestamp`."""
         if self.folder is None:
             return
+        if screen_filter != "classic" and self.options and "rasterize_mode" not in self.options:
+            warn(f"{folder.name}: its config.yml is of a nerfstudio without rasterize_mode, which draws the splats classic, and not {screen_filter}")
         for file in (self.folder / "config.yml", self.folder / "dataparser_transforms.json"):
             if file.is_file():
                 text = file.read_text(encoding="utf-8")

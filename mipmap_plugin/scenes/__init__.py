@@ -13,11 +13,13 @@ from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.process.torch_modes import in_usual_modes
 from mipmap_plugin.scenes.base import Scene
-from mipmap_plugin.scenes.cameras_json import DEFORMABLE, photographs_folder, read_cameras, write_cameras
-from mipmap_plugin.scenes.colmap import UNBENT, is_colmap, read_colmap, unbent_by
+from mipmap_plugin.scenes.cameras_json import read_cameras, write_cameras
+from mipmap_plugin.scenes.colmap import is_colmap, read_colmap
+from mipmap_plugin.scenes.dynerf import is_dynerf, read_dynerf
+from mipmap_plugin.scenes.hypernerf import is_hypernerf, read_hypernerf
 from mipmap_plugin.scenes.in_ply import cameras_in
-from mipmap_plugin.scenes.moving import is_dynerf, is_hypernerf, read_dynerf, read_hypernerf
 from mipmap_plugin.scenes.orbits import orbit
+from mipmap_plugin.scenes.training_options import DEFORMABLE, UNBENT, photographs_folder, unbent_by
 from mipmap_plugin.scenes.trajectories import jittered
 from mipmap_plugin.scenes.transforms import read_transforms
 

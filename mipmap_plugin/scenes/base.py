@@ -47,7 +47,7 @@ class Scene:
         applied_scale: The scale that it applied then.
         lenses: Of photographs that have to be undistorted.
         numbers: By which a training may order the cameras' images: COLMAP's numbers, or the order of the paths in transforms files; () elsewhere.
-        as_4dgaussians: It is a capture that Deformable 3D Gaussians, too, is trained on, but was read as 4DGaussians does (`scenes.moving`).
+        as_4dgaussians: It is a capture that Deformable 3D Gaussians, too, is trained on, but was read as 4DGaussians does (`dynerf`, `hypernerf`).
     """
 
     cameras: tuple[Camera, ...]

@@ -17,10 +17,10 @@ from mipmap_plugin.errors import SceneError, brief, plural, some_of, warn
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import pixels
 from mipmap_plugin.scenes.base import ABSENT, MASKED, SPLIT, Scene, note_on_shapes, other_shape
-from mipmap_plugin.scenes.cameras_json import TEST_EVERY, numbers_views, photographs_folder, tests_by_lod, trained_size
 from mipmap_plugin.scenes.colmap_sizes import refuse_truncated
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, note
 from mipmap_plugin.scenes.listed_images import WHOLE, image_file
+from mipmap_plugin.scenes.training_options import TEST_EVERY, numbers_views, photographs_folder, tests_by_lod, trained_size, unbent_by
 
 if TYPE_CHECKING:
     import pycolmap
@@ -34,16 +34,12 @@ BETWEEN = ("0", "sparse", "colmap")
 # Folders beside that of photographs: of masks, as Brush reads them, and of what 3DGS's convert.py undistorts.
 MASKS, BENT = "masks", "input"
 
-# An option in the cfg_args of Scaffold-GS and Octree-GS, and one of 4DGaussians; and the lenses that bend which these take for pinholes.
-UNBENT = {"n_offsets": ("SIMPLE_RADIAL",), "kplanes_config": ("SIMPLE_RADIAL", "OPENCV")}
-
-
 def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     """The scene of a folder with `sparse/0` and images, or of the folder of the model itself.
 
     Of several models (sparse/0, sparse/1, ...) the first is read, as by 3DGS, gsplat and nerfstudio; a larger one is warned of, for Brush takes that.
     `cfg` is the checkpoint's cfg_args: `images` names the folder of photographs and `resolution` the training size; the principal
-    point is moved to the center, as projects with cfg_args do, and lenses that the project takes for pinholes are (`UNBENT`). Without it, the
+    point is moved to the center, as projects with cfg_args do, and lenses that the project takes for pinholes are (`unbent_by`). Without it, the
     photographs in `images` are used at their full size; where only copies are there (images_4), their cameras keep the full size. A camera whose
     photograph is missing stays a usable view; `notes` count them.
 
@@ -98,11 +94,6 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         notes.append(f"the project of the checkpoint takes lenses that bend ({', '.join(models)}) for pinholes: photographs are not undistorted")
     numbers = tuple(image.image_id for image in images)
     return Scene(tuple(cameras), photographs, path, notes, points=_points(model), lenses=lenses, numbers=numbers)
-
-
-def unbent_by(cfg: dict[str, Any]) -> set[str]:
-    """The models of lenses that bend which the project with these cfg_args takes for pinholes."""
-    return {model for option, models in UNBENT.items() if option in cfg for model in models}
 
 
 def is_colmap(path: Path) -> bool:

@@ -17,10 +17,11 @@ from mipmap_plugin.errors import SceneError, plural
 from mipmap_plugin.formats.images import image_size
 from mipmap_plugin.formats.json_file import ROTATION_TOLERANCE, numbers, pixels, positive, present, read_json, rotation
 from mipmap_plugin.scenes.base import ABSENT, MASKED, Scene, note_on_shapes, other_shape
-from mipmap_plugin.scenes.cameras_json import numbers_views, principal_point, trained_size
+from mipmap_plugin.scenes.cameras_json import principal_point
 from mipmap_plugin.scenes.intrinsics import DISTORTION, overruled, values_of
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, can_undistort, note
 from mipmap_plugin.scenes.listed_images import listed_images, place_of, stem_of
+from mipmap_plugin.scenes.training_options import FOUR_D, numbers_views, trained_size
 
 PERSPECTIVE_MODELS = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
@@ -98,9 +99,9 @@ def _first_file(folder: Path, *names: str) -> list[Path]:
 def _as_trained(views: list[View], cfg: dict[str, Any]) -> list[View]:
     """The views as projects with cfg_args take them: at their training size, with the principal point in the middle.
 
-    4DGaussians, which has the option `kplanes_config`, takes no notice of `resolution`, and divides all times by the last one.
+    4DGaussians takes no notice of `resolution`, and divides all times by the last one.
     """
-    is_4dgs = "kplanes_config" in cfg
+    is_4dgs = FOUR_D in cfg
     last = (max((camera.time or 0.0 for camera, _, _ in views)) if is_4dgs else 0.0) or 1.0
     trained, numbers = list[View](), count()
     for camera, image, lens in views:

@@ -14,7 +14,7 @@ from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.errors import plural, warn
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.torch_file import load_torch
-from mipmap_plugin.models.mip import unread
+from mipmap_plugin.models.loaders import unread
 from mipmap_plugin.tiles.folder import START
 from mipmap_plugin.tiles.scene import TiledScene
 from mipmap_plugin.tiles.start import psnr

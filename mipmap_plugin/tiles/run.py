@@ -24,7 +24,7 @@ from mipmap_plugin.formats.tags import with_tags
 from mipmap_plugin.jobs.engines import in_this_process
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.models.inria_folder import cfg_args_for, write_folder
-from mipmap_plugin.models.mip import for_loader_of
+from mipmap_plugin.models.loaders import for_loader_of
 from mipmap_plugin.models.places import REPORT, page_of
 from mipmap_plugin.process import threads as thread_pool
 from mipmap_plugin.process.freed_memory import return_freed_memory

@@ -18,6 +18,7 @@ from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SceneError
+from mipmap_plugin.formats.atomic import named
 from mipmap_plugin.levels.manifest import MANIFEST, read_manifest
 from mipmap_plugin.viewing.screen import inside
 from mipmap_plugin.wrap import Wrapped, wrap_model
@@ -121,8 +122,8 @@ def coarser(effects: Effects, factor: float) -> Effects:
 def open_source(path: Path, base: Wrapped, backend: str) -> Source:
     """An adapted file, or the folder of a ladder of levels. Raises CheckpointError, and SceneError for a ladder that is damaged or by distance."""
     if not (path / MANIFEST).is_file():
-        return File(path.resolve().name, _wrapped(path, base, backend))
-    name = path.resolve().name
+        return File(named(path).name, _wrapped(path, base, backend))
+    name = named(path).name
     return Levels(name, [(least, File(f"{name}, {file}", _wrapped(path / file, base, backend))) for least, file in _levels(path)])
 
 

@@ -13,8 +13,8 @@ from levels_photographs import against, photograph
 from PIL import Image
 
 from mipmap_plugin import wrap_model
+from mipmap_plugin.evaluation.judged import JudgedView as Shot
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
-from mipmap_plugin.evaluation.protocols import TestView as Shot
 
 
 @pytest.fixture

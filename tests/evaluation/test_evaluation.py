@@ -8,8 +8,9 @@ import tiny
 import torch
 
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.evaluation import measure, photographs, protocols
+from mipmap_plugin.evaluation import measure, photographs
 from mipmap_plugin.evaluation.evaluate import Evaluator, Row, all_rows, evaluator_of, means, training_free_rows
+from mipmap_plugin.evaluation.judged import JudgedView, judged_views
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.evaluation.published import PUBLISHED, published
@@ -45,7 +46,7 @@ def evaluate(model, scene, scales, recipes, protocol, perceptual=None, **setting
 def test_test_views_are_brought_to_the_density_of_the_base(scene):
     base = tiny.cameras()[0]
     for scale in (1, 1 / 2):
-        views = protocols.test_views(scene, [base.zoomed(scale)], BLACK)
+        views = judged_views(scene, [base.zoomed(scale)], BLACK)
         assert [view.camera.name for view in views] == ["view_0", "view_1"]
         assert all(view.camera.split == "test" and view.camera.size == (24 * scale, 32 * scale) for view in views)
         assert all(view.photograph.shape == (24, 32, 3) for view in views)
@@ -76,19 +77,19 @@ def test_beyond_the_limit_photographs_are_read_again(scene, monkeypatch):
 
 def test_all_photographs_are_judged_by_where_none_is_a_test_view(scene):
     only_train = replace(scene, cameras=tuple(scene.split("train")))
-    assert len(protocols.test_views(only_train, tiny.cameras(), BLACK)) == 3
+    assert len(judged_views(only_train, tiny.cameras(), BLACK)) == 3
 
 
 def test_a_scene_without_photographs_is_refused(scene):
     with pytest.raises(SettingsError, match="there are no photographs to compare with"):
-        protocols.test_views(replace(scene, images={}), tiny.cameras(), BLACK)
+        judged_views(replace(scene, images={}), tiny.cameras(), BLACK)
 
 
 # Rows
 
 
 def test_a_row_is_the_mean_over_the_views_of_each_views_decibel(scene):
-    views = protocols.test_views(scene, tiny.cameras(), BLACK)
+    views = judged_views(scene, tiny.cameras(), BLACK)
     row = Evaluator(views, PROTOCOLS["P3"]).row("black", 1, lambda camera: torch.zeros(*camera.size, 3), gaussians=7)
     assert row.psnr_db == pytest.approx(sum(psnr(torch.zeros(24, 32, 3), view.photograph) for view in views) / 2)
     assert (row.name, row.scale, row.gaussians, row.adapt_seconds, row.adapted_on) == ("black", 1, 7, 0.0, "-")
@@ -96,7 +97,7 @@ def test_a_row_is_the_mean_over_the_views_of_each_views_decibel(scene):
 
 
 def test_the_base_against_photographs_of_itself_is_perfect(model, scene):
-    views = protocols.test_views(scene, tiny.cameras(), BLACK)
+    views = judged_views(scene, tiny.cameras(), BLACK)
     [row] = training_free_rows(model, Evaluator(views, PROTOCOLS["P3"]), 1)
     assert row.name == "base" and row.psnr_db > 50 and row.ssim == pytest.approx(1.0, abs=1e-3)
 
@@ -135,7 +136,7 @@ def test_what_is_scored_is_the_last_state_and_what_is_held_out_the_best(model, s
 def test_an_upsampler_has_a_row_of_its_own(model, scene, monkeypatch):
     gray = {"bicubic": 0.0, "mine": 0.999}
     monkeypatch.setattr(measure, "find_upsampler", lambda name: lambda image, size: image.new_full((*size, 3), gray[name]))
-    views = [protocols.TestView(tiny.cameras(1)[0], torch.ones(96, 128, 3), Path("photograph.png"))]
+    views = [JudgedView(tiny.cameras(1)[0], torch.ones(96, 128, 3), Path("photograph.png"))]
     rows = {row.name: row.psnr_db for row in training_free_rows(model, Evaluator(views, PROTOCOLS["P3"]), 2, "mine")}
     assert rows["base, resized"] < 1 and rows["base upsampled by mine"] > 50
 

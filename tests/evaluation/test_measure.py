@@ -17,8 +17,8 @@ from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
 from mipmap_plugin.adaptation.warn import silent, warn
 from mipmap_plugin.backends.reference import ReferenceBackend
-from mipmap_plugin.evaluation import protocols
 from mipmap_plugin.evaluation.evaluate import Evaluator, training_free_rows
+from mipmap_plugin.evaluation.judged import judged_views
 from mipmap_plugin.evaluation.measure import baselines, resized_base, views_seen, warm_stopwatch, warm_up
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol
 from mipmap_plugin.evaluation.tradeoff.measuring import measure
@@ -85,7 +85,7 @@ def test_an_upsampler_stands_beside_the_bicubic_one_at_zoom_in_only():
 
 def test_a_table_and_a_tradeoff_have_the_same_rivals_under_the_same_names_with_the_same_decibels(tmp_path):
     model, scene = wrapped(), load_scene(tiny.scene(tmp_path / "scene", count=30))
-    judge = Evaluator(protocols.test_views(scene, model.cameras, model.background), PROTOCOLS["P3"])
+    judge = Evaluator(judged_views(scene, model.cameras, model.background), PROTOCOLS["P3"])
     rows = {row.name: row.psnr_db for row in training_free_rows(model, judge, 1 / 4)}
     plan = Plan(recipes=(), backends=("reference",), supersampling=(4,), renderers=False, repeats=1)
     points = {point.name: point.psnr_db.median for point in measure(model, photographs(model, scene, 1 / 4, None), 1 / 4, plan)}
@@ -118,7 +118,7 @@ def test_every_protocol_names_the_filter_that_makes_its_truth():
 def test_the_base_resized_is_the_ceiling_of_what_is_judged_by_the_same_filter(tmp_path):
     """The photographs are the base's own images: only the filter is between them and the truth."""
     model, scene = wrapped(), load_scene(tiny.scene(tmp_path / "scene", count=30))
-    judge = Evaluator(protocols.test_views(scene, model.cameras, model.background), Protocol("floats", "pil-bicubic", eight_bit=False))
+    judge = Evaluator(judged_views(scene, model.cameras, model.background), Protocol("floats", "pil-bicubic", eight_bit=False))
     rows = {row.name: row.psnr_db for row in training_free_rows(model, judge, 1 / 4)}
     assert rows["base, resized"] > max(rows[name] for name in rows if name != "base, resized") + 10
 

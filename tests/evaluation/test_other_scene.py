@@ -10,8 +10,9 @@ from PIL import Image
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.cli import main
+from mipmap_plugin.evaluation.judged import photographed_views
 from mipmap_plugin.evaluation.other_scene import of_another_scene, of_another_size
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, photographed_views
+from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.evaluation.tradeoff.truth import photographs
 from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.models.vanilla import VanillaModel

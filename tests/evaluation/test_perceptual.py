@@ -89,6 +89,16 @@ def test_another_file_is_refused(tmp_path, random_weights):
             Perceptual("alex", file)
 
 
+@pytest.mark.parametrize(("kept", "said"), [({"weights": torch.zeros(3)}, "holds no alex backbone as torchvision saves it"), (None, "is damaged")])
+def test_an_earlier_download_that_is_of_no_use_is_named(tmp_path, monkeypatch, kept, said):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    file = tmp_path / "hub/checkpoints/alexnet-owt-7be5be79.pth"
+    file.parent.mkdir(parents=True)
+    torch.save(kept, file) if kept else file.write_text("cut off")
+    with pytest.raises(CheckpointError, match=rf"checkpoints/alexnet-owt-7be5be79.pth {said}.*; remove it, so that it is downloaded again"):
+        Perceptual("alex")
+
+
 def test_what_lacks_is_named_with_its_remedy(monkeypatch):
     monkeypatch.setattr(torch.hub, "load_state_dict_from_url", Mock(side_effect=urllib.error.URLError("no route")))
     with pytest.raises(SettingsError, match=r"cannot be downloaded .*no route.*; download https://.*vgg16.* and give the file \(--lpips-weights\)"):

@@ -15,6 +15,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation import protocols
 from mipmap_plugin.evaluation.evaluate import Evaluator
+from mipmap_plugin.evaluation.judged import JudgedView, judged_views, ready_made
 from mipmap_plugin.evaluation.metrics import SAME_DB
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.formats.images import write_image
@@ -29,7 +30,7 @@ def noise(*shape, seed=0):
 
 def test_p1_truncates_the_mean_of_blocks():
     photograph = noise(24, 32, 3)
-    view = protocols.TestView(tiny.cameras(1)[0], photograph, Path("photograph.png"))
+    view = JudgedView(tiny.cameras(1)[0], photograph, Path("photograph.png"))
     means = photograph.view(6, 4, 8, 4, 3).mean(dim=(1, 3)) * 255
     torch.testing.assert_close(view.truth(1 / 4, PROTOCOLS["P1"]) * 255, means.floor(), atol=1e-3, rtol=0)
 
@@ -43,11 +44,11 @@ def test_p1_averages_colors_and_alpha_by_themselves_and_composites_afterwards(tm
     block = np.array([[[255, 0, 0, 255], [0, 0, 255, 0]], [[0, 0, 0, 128], [0, 0, 0, 128]]], np.uint8)
     Image.fromarray(np.tile(block, (24, 32, 1))).save(tmp_path / "photograph.png")
     cameras = [replace(camera, split="test") for camera in tiny.cameras(1)]
-    [view] = protocols.test_views(Scene(tuple(cameras), {cameras[0]: tmp_path / "photograph.png"}, tmp_path), tiny.cameras(1), (1.0, 1.0, 1.0))
+    [view] = judged_views(Scene(tuple(cameras), {cameras[0]: tmp_path / "photograph.png"}, tmp_path), tiny.cameras(1), (1.0, 1.0, 1.0))
     for scale in (1, 1 / 2, 1 / 4):  # of a photograph of twice the base's size
         truth = (view.truth(scale, PROTOCOLS["P1"]) * 255).round().byte()
         assert truth.shape == (24 * scale, 32 * scale, 3) and truth.unique(dim=0).unique(dim=1).tolist() == [[[159, 128, 159]]]
-    opaque = protocols.TestView(view.camera, view.photograph, view.file, view.background, distorted=True, transparent=True)
+    opaque = JudgedView(view.camera, view.photograph, view.file, view.background, distorted=True, transparent=True)
     assert torch.equal(opaque.truth(1, PROTOCOLS["P1"]), PROTOCOLS["P1"].shrunk(view.photograph, (24, 32)))
     assert torch.equal(view.truth(1 / 2, PROTOCOLS["P3"]), PROTOCOLS["P3"].shrunk(view.photograph, (12, 16)))
 
@@ -61,14 +62,14 @@ def test_p1_averages_colors_and_alpha_by_themselves_and_composites_afterwards(tm
     ids=["without whole blocks", "too small"],
 )
 def test_a_photograph_of_which_there_is_no_truth_says_what_to_do(protocol, size, scale, told):
-    view = protocols.TestView(tiny.cameras(1)[0], noise(*size, 3), Path("photograph.png"))
+    view = JudgedView(tiny.cameras(1)[0], noise(*size, 3), Path("photograph.png"))
     with pytest.raises(SettingsError, match=told):
         view.truth(scale, PROTOCOLS[protocol])
 
 
 def test_p3_is_pillows_bicubic_on_bytes_and_not_on_floats():
     stored = (noise(24, 32, 3) > 0.5).byte().mul(255)  # black and white: Pillow clamps between its two passes
-    view = protocols.TestView(tiny.cameras(1)[0], stored / 255, Path("photograph.png"))
+    view = JudgedView(tiny.cameras(1)[0], stored / 255, Path("photograph.png"))
     bytes_of_pillow = np.asarray(Image.fromarray(stored.numpy()).resize((8, 6), Image.Resampling.BICUBIC))
     truth = (view.truth(1 / 4, PROTOCOLS["P3"]) * 255).round().byte().numpy()
     on_floats = (resize(stored / 255, (6, 8), "pil-bicubic").clamp(0, 1) * 255).round().byte().numpy()
@@ -79,7 +80,7 @@ def test_images_are_judged_as_the_8_bit_files_that_they_would_be_saved_as():
     image = torch.tensor([-0.1, 0.49 / 255, 0.51 / 255, 1.2])
     assert all(torch.equal(each.as_saved(image), torch.tensor([0, 0, 1 / 255, 1])) for each in PROTOCOLS.values())
     assert torch.equal(protocols.Protocol("floats", "area", eight_bit=False).as_saved(image), image)
-    views = [protocols.TestView(tiny.cameras(1)[0], torch.full((24, 32, 3), 100 / 255), Path("photograph.png"))]
+    views = [JudgedView(tiny.cameras(1)[0], torch.full((24, 32, 3), 100 / 255), Path("photograph.png"))]
     row = Evaluator(views, PROTOCOLS["P3"]).row("gray", 1, lambda camera: torch.full((*camera.size, 3), 100.4 / 255), gaussians=0)
     assert row.psnr_db == SAME_DB
 
@@ -92,7 +93,7 @@ def test_a_photograph_is_large_enough_for_a_base_whose_size_was_rounded_up(monke
     full = Camera(width, height, 4000.0, 4000.0, width / 2, height / 2, torch.eye(4), "view", "test")
     base = full.resized(int(width / divisor + 0.5), int(height / divisor + 0.5))
     [camera] = at_density_of([full], [base])
-    view = protocols.TestView(camera, torch.zeros(1).expand(*size, 3), Path("photograph.png"))
+    view = JudgedView(camera, torch.zeros(1).expand(*size, 3), Path("photograph.png"))
     assert view.truth(divisor, PROTOCOLS["P3"]) == camera.zoomed(divisor).size
 
 
@@ -106,7 +107,7 @@ def folders(tmp_path):
 
 @pytest.mark.parametrize(("scale", "value"), [(1, 0.6), (2, 0.4), (4, 0.2)])
 def test_p4_reads_the_copy_that_has_the_size(folders, scale, value):
-    view = protocols.TestView(replace(tiny.cameras(1)[0], width=33), noise(97, 130, 3), folders / "images_2" / "left" / "a.png")
+    view = JudgedView(replace(tiny.cameras(1)[0], width=33), noise(97, 130, 3), folders / "images_2" / "left" / "a.png")
     truth = view.truth(scale, PROTOCOLS["P4"])
     assert truth.shape == (24 * scale, 33 * scale, 3)
     torch.testing.assert_close(truth, torch.full_like(truth, value), atol=1e-3, rtol=0)
@@ -114,14 +115,14 @@ def test_p4_reads_the_copy_that_has_the_size(folders, scale, value):
 
 def test_p4_takes_copies_whose_size_differs_by_rounding_alone(folders):
     photograph = folders / "images" / "left" / "a.png"
-    assert protocols.ready_made(photograph, (28, 33)) == folders / "images_4" / "left" / "a.png"
+    assert ready_made(photograph, (28, 33)) == folders / "images_4" / "left" / "a.png"
     with pytest.raises(SettingsError, match=r"P4 needs a\.png at 33 x 29 px"):
-        protocols.ready_made(photograph, (29, 33))
+        ready_made(photograph, (29, 33))
 
 
 def test_p4_refuses_a_size_that_no_folder_has(folders, tmp_path):
-    view = protocols.TestView(tiny.cameras(1)[0], noise(97, 130, 3), folders / "images" / "left" / "a.png")
+    view = JudgedView(tiny.cameras(1)[0], noise(97, 130, 3), folders / "images" / "left" / "a.png")
     with pytest.raises(SettingsError, match=r"P4 needs a\.png at 16 x 12 px .* but there is 130 x 97, 65 x 49, 33 x 24; evaluate a"):
         view.truth(1 / 2, PROTOCOLS["P4"])
     with pytest.raises(SettingsError, match="but there is none"):
-        protocols.ready_made(tmp_path / "a.png", (12, 16))
+        ready_made(tmp_path / "a.png", (12, 16))

@@ -3,6 +3,7 @@
 import re
 from statistics import fmean
 
+import moving
 import pytest
 import tiny
 import torch_checkpoints
@@ -52,6 +53,13 @@ def test_fewer_views_are_drawn_of_more_splats_and_none_of_too_many(tmp_path, mon
     monkeypatch.setattr(module, "SPLATS", 59)
     monkeypatch.setattr(model, "render", None)  # nothing is drawn
     assert viewer_differences(model).startswith("not drawn: 60 splats on 768 pixels take too long")
+
+
+def test_of_a_model_that_no_viewer_draws_no_splats_are_made(tmp_path, monkeypatch):
+    """By a network, which takes long."""
+    model = wrap_model(moving.write_deformable(tmp_path / "model"))
+    monkeypatch.setattr(type(model.model), "gaussians", None)
+    assert viewer_differences(model) == "not drawn: a network moves its splats, which none of the viewers supports"
 
 
 def test_a_slow_backend_draws_nothing(tmp_path):

@@ -10,13 +10,14 @@ import torch
 from oracle import brute_force
 from torch_checkpoints import Hostile, activated, aim, equal, gsplat_folder, normalized_by_numpy, splatfacto_folder, splats
 
-from mipmap_plugin.errors import CheckpointError, OutputExists, SceneError
+from mipmap_plugin.errors import CheckpointError, SceneError
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.formats.yaml_scalars import read_scalars
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.adapted_name import adapted_name
+from mipmap_plugin.models.adapted_scale import adapted_scale, adapted_viewer
 from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.wrap import wrap_model
 
@@ -135,6 +136,15 @@ def test_a_file_for_a_viewer_is_read_back_with_its_dilation(tmp_path, viewer, wr
     assert (trained.screen_filter, trained.eps2d) == ("mip", base.effects(viewer=viewer).eps2d)
 
 
+@pytest.mark.parametrize("write", [gsplat_folder, splatfacto_folder])
+def test_an_adapted_file_is_known_for_one_without_its_report(tmp_path, write):
+    """Its pictures at x1, to which it would be adapted again, are wrong."""
+    adapted = wrap_model(write(tmp_path / "r", splats()), cameras=tiny.cameras()).adapt(1 / 2, viewer="classic", recipe="instant")
+    file = adapted.save(tmp_path / "out")
+    file.with_name(f"{file.name}.adaptation.json").unlink()
+    assert (adapted_scale(file), adapted_viewer(file), adapted_scale(load_model(tmp_path / "r").source)) == (0.5, "classic", None)
+
+
 @pytest.mark.parametrize("target", ["out", "out.pt"])
 def test_a_file_of_its_own_format_keeps_all_bands_and_is_not_said_to_lack_some(tmp_path, target):
     """A loader of PLYs does not read it, whatever bands it has."""
@@ -154,15 +164,6 @@ def test_a_ply_is_written_on_request(tmp_path):
     raw = splats()
     saved = load_model(gsplat_folder(tmp_path / "r", raw)).save(tmp_path / "out.ply", provenance={})
     assert np.array_equal(read_ply(saved).columns["scale_1"], raw["scales"][:, 1].numpy())
-
-
-def test_nothing_is_lost_by_saving(tmp_path):
-    model = load_model(gsplat_folder(tmp_path / "r", splats()))
-    for target in ("r", "r/ckpts/ckpt_6999_rank0.pt"):
-        with pytest.raises(OutputExists):
-            model.save(tmp_path / target, provenance={})
-    with pytest.raises(OutputExists, match="the base checkpoint itself"):
-        model.save(tmp_path / "r", provenance={}, overwrite=True)
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from mipmap_plugin.models.base import Traits
 from mipmap_plugin.models.moving import memory
 from mipmap_plugin.models.moving.hexplane import HexPlane
 from mipmap_plugin.models.moving.memory import Memory
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.wrap import Interrupted, wrap_model
@@ -169,10 +170,20 @@ def test_rows_that_are_left_move_as_before_without_an_evaluation(tmp_path, monke
     student, camera, rows = model.copy(), moving.at(0.2), torch.arange(0, 60, 3)
     student.follow(reach=0.1)
     before = student.gaussians(camera).means[rows]
-    student.keep_rows(rows)
+    student.keep_motions(rows)
     student.replace_parameters({name: tensor.detach()[rows].requires_grad_() for name, tensor in student.parameters().items()})
     monkeypatch.setattr(model._memory, "_evaluate", None)
     assert torch.equal(student.gaussians(camera).means, before)
+
+
+def test_no_copy_of_plain_splats_is_made_when_some_are_dropped(monkeypatch):
+    """Nothing moves, so that nobody has to be told which rows are left."""
+    copies = []
+    monkeypatch.setattr(VanillaModel, "keep_rows", lambda model, keep: copies.append(len(keep)))
+    adapted = wrap_model(tiny.model(), cameras=tiny.cameras()).adapt(
+        1 / 4, steps=4, extra_views=0, merge_to=1.0, closed_form=False, prune_every=2, min_opacity=0.4, returns="last"
+    )
+    assert 0 < len(adapted.model.parameters()["means"]) < 60 and copies == []
 
 
 def test_other_rows_are_evaluated_anew(tmp_path):
@@ -192,7 +203,7 @@ def test_the_reach_is_shorter_where_neighbors_move_otherwise(tmp_path):
 
 def test_views_are_at_the_nearest_of_few_moments():
     views = at_times(11)
-    assert [view.time for view in at_moments(views, 3)] == [0, 0, 0, 0.5, 0.5, 0.5, 0.5, 0.5, 1, 1, 1][:3] + [0.5] * 5 + [1] * 3
+    assert [view.time for view in at_moments(views, 3)] == [0] * 3 + [0.5] * 5 + [1] * 3
     assert at_moments(views, None) == views == at_moments(views, 11)
     assert [view.viewmat.tolist() for view in at_moments(views, 2)] == [view.viewmat.tolist() for view in views]
 

@@ -9,7 +9,7 @@ import torch
 from oracle import brute_force
 from torch_checkpoints import Hostile, activated, aim, equal, splatfacto_content, splatfacto_folder, splatfacto_state, splats
 
-from mipmap_plugin.errors import CheckpointError, OutputError, OutputExists, SceneError
+from mipmap_plugin.errors import CheckpointError, OutputError, SceneError
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.formats.yaml_scalars import read_scalars
 from mipmap_plugin.models import load_model
@@ -87,6 +87,15 @@ def test_a_folder_is_written_that_nerfstudio_finds_beside_the_old_one(tmp_path):
     assert json.loads((tmp_path / "x0.25/dataparser_transforms.json").read_text()) == TRANSFORMS
     again = load_model(tmp_path / "x0.25")
     assert equal(again, raw) and again.trained.screen_filter == "classic"
+
+
+def test_a_run_of_a_version_without_the_option_is_told_to_be_drawn_classic(tmp_path):
+    folder = splatfacto_folder(tmp_path / "r", splats())
+    config = folder / "config.yml"
+    config.write_text("".join(line for line in config.read_text().splitlines(keepends=True) if "rasterize_mode" not in line))
+    adapted = wrap_model(folder, cameras=tiny.cameras()).adapt(1 / 2, viewer="nerfstudio-antialiased", recipe="instant")
+    with pytest.warns(UserWarning, match="out: its config.yml is of a nerfstudio without rasterize_mode, which draws the splats classic, and not"):
+        adapted.save(tmp_path / "out")
 
 
 def test_colors_without_sh_come_back_as_the_same_colors(tmp_path):
@@ -186,10 +195,7 @@ def test_what_is_no_splatfacto_checkpoint_is_refused_in_one_sentence(tmp_path, p
     assert capsys.readouterr().out == ""
 
 
-def test_nothing_is_lost_by_saving(tmp_path):
+def test_no_name_is_written_that_nerfstudio_stops_at(tmp_path):
     model = load_model(splatfacto_folder(tmp_path / "r", splats()))
-    for target in ("r", f"r/{CKPT}"):
-        with pytest.raises(OutputExists):
-            model.save(tmp_path / target, provenance={})
     with pytest.raises(OutputError, match="nerfstudio reads the step from every name"):
         model.save(tmp_path / "r/nerfstudio_models/adapted.ckpt", provenance={})

@@ -9,7 +9,8 @@ from scene_files import ROTATION, TRANSLATION, entry, write_json
 
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.scenes import load_scene, read_cameras
-from mipmap_plugin.scenes.cameras_json import count_test_cameras, trained_size
+from mipmap_plugin.scenes.cameras_json import count_test_cameras
+from mipmap_plugin.scenes.training_options import trained_size
 
 
 def test_a_known_entry_gives_the_known_view(tmp_path):

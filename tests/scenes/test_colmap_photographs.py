@@ -7,8 +7,8 @@ from PIL import Image
 
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.errors import SceneError, SettingsError
+from mipmap_plugin.evaluation.judged import judged_views
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
-from mipmap_plugin.evaluation.protocols import test_views as judged_views
 from mipmap_plugin.scenes import load_photographs, load_scene
 
 pycolmap = pytest.importorskip("pycolmap", reason="COLMAP scenes are read by pycolmap, an extra")

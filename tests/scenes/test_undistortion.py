@@ -15,6 +15,7 @@ from mipmap_plugin.adaptation.target.photographs import placed
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError, SettingsError
 from mipmap_plugin.evaluation import protocols
+from mipmap_plugin.evaluation.judged import judged_views
 from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.models import load_model
 from mipmap_plugin.scenes import load_scene
@@ -105,7 +106,7 @@ def test_a_distorted_scene_has_cameras_to_adapt_with_and_images_to_evaluate_on(t
     scene = nerfstudio_scene(tmp_path / "s", "OPENCV")
     wrapped = wrap_model(tiny.model(), cameras=scene)
     assert wrapped.adapt(1 / 4, steps=1, views="given").report.views == "the 1 given view"
-    [view] = protocols.test_views(scene, scene.cameras, (0.0, 0.0, 0.0))
+    [view] = judged_views(scene, scene.cameras, (0.0, 0.0, 0.0))
     assert_dots_at(view.camera, view.truth(1.0, protocols.PROTOCOLS["P3"]))
     with pytest.raises(SettingsError, match=r"P4.*lens distortion"):
         view.truth(1.0, protocols.PROTOCOLS["P4"])

@@ -19,7 +19,7 @@ from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.mip import for_loader_of
+from mipmap_plugin.models.loaders import for_loader_of
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained, flattened
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.process.garbage import uncollected

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from mipmap_plugin.errors import SettingsError, plural
 from mipmap_plugin.evaluation.cells import Cells
-from mipmap_plugin.evaluation.protocols import not_exposed, not_held_out
+from mipmap_plugin.evaluation.judged import not_exposed, not_held_out
 from mipmap_plugin.evaluation.tradeoff.files import KEPT, Folder, goes_on, write
 from mipmap_plugin.evaluation.tradeoff.front import Tradeoff
 from mipmap_plugin.evaluation.tradeoff.measuring import left_out, measure

@@ -14,10 +14,11 @@ from mipmap_plugin.adaptation.views import choose_views, with_times
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError, plural, warn
+from mipmap_plugin.evaluation.judged import photographed_views
 from mipmap_plugin.evaluation.measure import RESIZED, resized_base, supersampled, views_seen
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.other_scene import of_another_scene, of_another_size
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, TruthView, photographed_views
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, TruthView
 from mipmap_plugin.scenes import Scene, jittered
 from mipmap_plugin.scenes.trajectories import with_company
 from mipmap_plugin.wrap import Wrapped

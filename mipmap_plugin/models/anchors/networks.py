@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import io
+import re
 import warnings
+import zipfile
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -20,6 +23,9 @@ Weights = dict[str, dict[str, Tensor]]  # network -> its state dict
 
 LAYERS = {"0.weight", "0.bias", "2.weight", "2.bias"}
 EMBEDDING = "embedding.weight"
+
+# In the archives that torch.jit writes: what only debuggers read, and how names of classes are told apart.
+OF_TRACING, NUMBERED = (".debug_pkl", "/serialization_id"), re.compile(rb"___torch_mangle_(\d+)")
 
 LAST: dict[str, nn.Module] = {"opacity_mlp": nn.Tanh(), "color_mlp": nn.Sigmoid(), "feature_bank_mlp": nn.Softmax(dim=1)}
 
@@ -128,7 +134,22 @@ def _traced(name: str, state: dict[str, Tensor]) -> bytes:
     content = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of torch.jit, the only way to write the original's format
+        torch.jit.trace(network, example)  # what is traced first in a process has the names without numbers
         torch.jit.save(torch.jit.trace(network, example), content)
+    return _repeatable(content)
+
+
+def _repeatable(archive: io.BytesIO) -> bytes:
+    """A TorchScript archive whose bytes follow from the network: without the calls by which it was traced, in which there are paths of this machine,
+    and with numbers in the names of classes that do not count what else the process has traced."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(archive) as traced, zipfile.ZipFile(content, "w") as out:
+        kept = [name for name in traced.namelist() if not name.endswith(OF_TRACING)]
+        numbers = sorted({int(number) for name in kept for number in NUMBERED.findall(name.encode())})
+        renumbered = partial(NUMBERED.sub, lambda name: b"___torch_mangle_%d" % numbers.index(int(name[1])))
+        for name in kept:
+            held = traced.read(name)
+            out.writestr(zipfile.ZipInfo(renumbered(name.encode()).decode()), held if "/data/" in name else renumbered(held))
     return content.getvalue()
 
 

@@ -70,7 +70,7 @@ class Memory:
         parts = list(side_by_side(lambda part: self._evaluate(part, time), chunks, for_views()))
         return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
-    def keep_rows(self, means: Tensor, rows: Tensor, left: Tensor) -> None:
+    def keep_of(self, means: Tensor, rows: Tensor, left: Tensor) -> None:
         """Keep what is known at `means` [N, 3] for those of their `rows` [M] that are `left` [M, 3], too."""
         with self._lock:
             known = {time: changes for (_, time), (place, changes) in self._known.items() if torch.equal(place, means)}

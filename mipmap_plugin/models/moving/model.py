@@ -151,12 +151,12 @@ class MovingModel:
         each = sum(memory.seconds / max(1, memory.evaluations) for memory in self._memories)
         return sum(memory.seconds for memory in self._memories), each
 
-    def keep_rows(self, rows: Tensor) -> None:
-        """Be told that only these `rows` [M] of the parameters, ascending, are going to be left."""
+    def keep_motions(self, rows: Tensor) -> None:
+        """Keep what is known of the motions of these `rows` [M] of the parameters, ascending, which alone are going to be left."""
         if self.held is not None:
             left = self.held[rows]
             for memory in self._memories:
-                memory.keep_rows(self.held, rows, left)
+                memory.keep_of(self.held, rows, left)
             self.held = left
 
     def parameters(self) -> dict[str, Tensor]:

@@ -19,7 +19,7 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.recipes import DEFAULT_IN, recipe
 from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.scenes.cameras_json import trained_size
+from mipmap_plugin.scenes.training_options import trained_size
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
 BLACK = (0.0, 0.0, 0.0)

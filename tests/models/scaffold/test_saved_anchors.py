@@ -46,6 +46,19 @@ def test_networks_that_moved_are_written_as_the_original_reads_them(tmp_path, na
     torch.testing.assert_close(network(values), (hidden @ state["2.weight"].T + state["2.bias"]).tanh())
 
 
+def test_networks_that_moved_are_the_same_bytes_whatever_was_traced_before_and_name_no_path(folder, tmp_path):
+    student = load_model(folder).copy()
+    with torch.no_grad():
+        student.shared_parameters()["opacity_mlp.0.bias"].add_(1)
+    student.save(tmp_path / "b" / "a.ply", provenance={})
+    first = (tmp_path / "b" / "opacity_mlp.pt").read_bytes()
+    torch.jit.trace(torch.nn.Sequential(torch.nn.Linear(2, 2), torch.nn.Tanh()), torch.zeros(1, 2))
+    student.save(tmp_path / "b" / "b.ply", provenance={})  # which the same networks serve
+    student.save(tmp_path / "c" / "a.ply", provenance={})
+    assert (tmp_path / "c" / "opacity_mlp.pt").read_bytes() == first
+    assert b"site-packages" not in first and b".py(" not in first
+
+
 def test_a_folder_without_cfg_args_gets_what_the_original_asks_for(tmp_path):
     load(tmp_path, LAYOUTS["distance of colors, appearance"], cfg=False).save(tmp_path / "saved", provenance={})
     text = (tmp_path / "saved/cfg_args").read_text()

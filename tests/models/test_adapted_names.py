@@ -1,0 +1,34 @@
+"""The names of adapted files are those by which their bases are called."""
+
+import pytest
+import tiny
+
+from mipmap_plugin.cli import main
+from mipmap_plugin.models import load_model
+from mipmap_plugin.models.adapted_name import adapted_name
+
+
+@pytest.fixture
+def linked(tmp_path):
+    """A file and a folder as caches of downloads have them: links with the names, to places that are called by what is in them."""
+    (tmp_path / "blobs").mkdir()
+    (tmp_path / "cache").mkdir()
+    tiny.ply(tmp_path / "made.ply").rename(tmp_path / "blobs/4fa1")
+    tiny.folder(tmp_path / "blobs/77c0")
+    (tmp_path / "cache/scene.ply").symlink_to("../blobs/4fa1")
+    (tmp_path / "cache/bicycle").symlink_to("../blobs/77c0")
+    return tmp_path / "cache"
+
+
+@pytest.mark.parametrize(("name", "adapted"), [("scene.ply", "scene_x0.25.ply"), ("bicycle", "bicycle_x0.25")])
+def test_what_is_adapted_from_a_link_lies_beside_the_link_and_has_its_name(linked, name, adapted):
+    assert main(["adapt", str(linked / name), "--scale", "1/4", "--recipe", "instant"]) == 0
+    assert len(load_model(linked / adapted)) == 60
+    assert {path.name for path in (linked.parent / "blobs").iterdir()} == {"4fa1", "77c0"}
+
+
+@pytest.mark.parametrize("given", [".", "point_cloud/.."])
+def test_a_folder_that_is_given_from_within_has_its_own_name(tmp_path, monkeypatch, given):
+    folder = tiny.folder(tmp_path / "bicycle")
+    monkeypatch.chdir(folder)
+    assert adapted_name(type(folder)(given), 1 / 4) == "bicycle_x0.25"
