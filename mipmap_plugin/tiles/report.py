@@ -17,7 +17,7 @@ from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.models.mip import unread
 from mipmap_plugin.tiles.folder import START
 from mipmap_plugin.tiles.scene import TiledScene
-from mipmap_plugin.tiles.start import psnr
+from mipmap_plugin.tiles.start import quality
 from mipmap_plugin.tiles.steering import Steered, open_state, result
 from mipmap_plugin.tiles.truth import Truths
 
@@ -31,7 +31,7 @@ def judged(scene: TiledScene) -> tuple[dict[str, float], str]:
     truths, start = Truths(scene), f"the start, {load_torch(scene.folder / START)['name']}"
     first, last = (open_state(scene, state) for state in (Steered.before(scene.folder, 0), result(scene.folder)))
     states = {AS_IT_IS: scene.base, start: first, JOINED: last}
-    psnrs = {name: psnr(scene, splats, truths, scene.views.choosing) for name, splats in states.items()}
+    psnrs = {name: quality(scene, splats, truths, scene.views.choosing).psnr for name, splats in states.items()}
     best = max(reversed(psnrs), key=psnrs.__getitem__)
     return psnrs, JOINED if scene.config.returns == "last" else best
 

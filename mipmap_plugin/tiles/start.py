@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.optimization.validation import mean_db
+from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS, pixel_size, views_for
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.blend_weights import may_show, whole_weights
-from mipmap_plugin.adaptation.start.candidates import mildest_costs, start_name
+from mipmap_plugin.adaptation.start.candidates import start_name
 from mipmap_plugin.adaptation.start.closed_form import FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import matched_opacities
-from mipmap_plugin.adaptation.start.merging import merge_seen
+from mipmap_plugin.adaptation.start.merging import merge_down, merge_seen
+from mipmap_plugin.adaptation.start.strength import Bounds, Candidate, Costs, Merger
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.gaussians import Gaussians
@@ -26,10 +28,8 @@ from mipmap_plugin.tiles.splats import Splats
 from mipmap_plugin.tiles.store import Store, write_store
 from mipmap_plugin.tiles.truth import Truths
 
-# The roots of `merge_to` that are tried, as without tiles (`strength.POWERS`): the last, the mildest, and then the others.
-ROOTS = (1, 2, 4)
-
-CANDIDATES = ("formed", "mildest", "merged")  # names of their files
+# What the files of candidates begin with: of the base's splats, and of merged ones.
+FORMED, MERGED = "formed", "merged"
 
 
 class StartSearch:
@@ -45,20 +45,21 @@ class StartSearch:
     @torch.no_grad()
     def run(self) -> None:
         """Write the start of each tile, and `start.pt`: its name, and its PSNR on the steering views."""
-        config, base_db = self.scene.config, self.steer(self.scene.base)
+        config, base = self.scene.config, self.steer(self.scene.base)
         if not (self.forms or config.merge_to < 1):
-            return self._take_base(base_db)
+            return self._take_base(base.psnr)
         weights = self._measured()
         pool.release_to_system()
-        self._candidate("formed", weights, 1.0)
-        formed_db = self.steer(self._open("formed"))
-        if self.alike and formed_db < base_db:  # the filter itself is the better answer, for merged splats too, as without tiles
-            self.forms, formed_db = False, base_db
-        if config.merge_to < 1 and self._takes_merged(weights, formed_db, base_db):
-            return
-        if formed_db < base_db or not self.forms:
-            return self._take_base(base_db)
-        self._take("formed", start_name(self.forms), formed_db)
+        self._write(FORMED, weights, 1.0)
+        formed = self.steer(self._open(FORMED))
+        if self.alike and formed.visible < base.visible:  # the filter itself is the better answer, for merged splats too, as without tiles
+            self.forms, formed = False, base
+        bounds = Bounds(formed.psnr - config.merging_costs, base.visible, formed.psnr)
+        if config.merge_to < 1 and (merged := self._merger(weights).strongest(bounds)):
+            return self._take(merged.made, start_name(self.forms, merged=True), merged.quality.psnr)
+        if not self.forms or formed.visible < base.visible:
+            return self._take_base(base.psnr)
+        self._take(FORMED, start_name(self.forms), formed.psnr)
 
     def _measured(self) -> Tensor:
         """[N]: the blend weights of the base's splats, in target pixels of a view, from as many views as show enough of them, as without tiles."""
@@ -70,29 +71,22 @@ class StartSearch:
             weights = weights.lerp(painter.weighed(scene.base, further)[0], len(further) / (len(first) + len(further)))
         return weights * scene.scale**2
 
-    def _takes_merged(self, weights: Tensor, formed_db: float, base_db: float) -> bool:
-        """Take the strongest merging that costs little, and return whether there is one; where the mildest costs too much, no other is tried."""
+    def _merger(self, weights: Tensor) -> Merger[str]:
+        """Merges the base's splats, which have these blend weights [N], into candidates, which it names."""
         scene, config = self.scene, self.scene.config
 
-        def tried(name: str, root: int, costs: float) -> tuple[float, bool]:
-            self._candidate(name, weights, config.merge_to ** (1 / root))
-            psnr = self.steer(self._open(name))
-            return psnr, psnr >= max(formed_db - costs, base_db)
+        def merge(power: float, coarsely: bool) -> Candidate[str]:
+            name = f"{MERGED}_{power:g}{'_coarsely' if coarsely else ''}"
+            self._write(name, weights, config.merge_to**power, coarsely)
+            splats = self._open(name)
+            return Candidate(name, self.steer(splats), len(splats))
 
-        title = start_name(self.forms, merged=True)
-        mildest_db, suits = tried("mildest", ROOTS[-1], mildest_costs(config, scene.base_effects, scene.target))
-        for root in ROOTS[:-1] if suits or mildest_db >= formed_db else ():
-            merged_db, is_taken = tried("merged", root, config.merging_costs)
-            if is_taken:
-                self._take("merged", title, merged_db)
-                return True
-        if suits:
-            self._take("mildest", title, mildest_db)
-        return suits
+        count, costs = sum(map(len, scene.cores)), Costs.of(config, scene.base_effects, scene.target)
+        return Merger(merge, lambda power: math.ceil(config.merge_to**power * count), costs)
 
-    def steer(self, splats: Splats) -> float:
-        """PSNR (dB) on the steering views."""
-        return psnr(self.scene, splats, self.truths, self.scene.views.steering)
+    def steer(self, splats: Splats) -> Quality:
+        """The quality on the steering views."""
+        return quality(self.scene, splats, self.truths, self.scene.views.steering)
 
     def _file(self, name: str, number: int) -> Path:
         return self.scene.folder / f"{name}_{number}.splats"
@@ -100,28 +94,34 @@ class StartSearch:
     def _open(self, name: str) -> Splats:
         return Splats.of(self.scene.kind, [Store(self._file(name, number)) for number in range(len(self.scene.cores))])
 
-    def _candidate(self, name: str, weights: Tensor, fraction: float) -> None:
-        """Write the closed form of the base after merging each core down to a fraction."""
-        cores = range(len(self.scene.cores))
-        merged = [self._merged(self._file(name, number), self.scene.cores[number], weights, fraction) for number in cores]
+    def _write(self, name: str, weights: Tensor, fraction: float, coarsely: bool = False) -> None:
+        """Write the closed form of the base after merging each core down to a fraction; `coarsely`: even where too few splats share a pixel."""
+        cores = enumerate(self.scene.cores)
+        merged = [self._merged(self._file(name, number), core, weights[core], fraction, coarsely) for number, core in cores]
         pool.release_to_system()
         if self.forms:
             self._match(name, *map(torch.cat, zip(*merged, strict=True)))
             pool.release_to_system()
 
-    def _merged(self, file: Path, core: Tensor, weights: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
-        """Write a core's candidate; returns its blend weights, and those that it had if nothing hid it."""
+    def _merged(self, file: Path, core: Tensor, own: Tensor, fraction: float, coarsely: bool) -> tuple[Tensor, Tensor]:
+        """Write a core's candidate, from its blend weights `own`; returns the candidate's, and those that it had if nothing hid it."""
         scene = self.scene
         model = scene.for_target(scene.base.parameters(core))
-        own, whole = weights[core], torch.empty(0)
+        whole = torch.empty(0)
+
+        def pixel_of(means: Tensor) -> Tensor:
+            return pixel_size(means, scene.views.adapted, len(self.views))
 
         def sizes(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
             """Of a base pixel at each splat, and of the splat's weight if nothing hid it."""
-            pixel = pixel_size(gaussians.means, scene.views.adapted, len(self.views))
+            pixel = pixel_of(gaussians.means)
             return pixel, whole_weights(gaussians, pixel, scene.views.adapted, scene.base_effects, scene.scale)
 
         def merged(gaussians: Gaussians) -> Gaussians:
             nonlocal own
+            if coarsely:
+                splats, own = merge_down(gaussians, lambda means: pixel_of(means) / scene.scale, own, math.ceil(fraction * len(gaussians)))
+                return splats
             pixel, before = sizes(gaussians)
             seen = may_show(own, before, gaussians.means, scene.views.adapted, self.views)
             splats, own = merge_seen(gaussians, pixel / scene.scale, own, fraction, seen)
@@ -162,21 +162,21 @@ class StartSearch:
 
     def _take_base(self, psnr: float) -> None:
         for number, core in enumerate(self.scene.cores):
-            write_store(self._file("formed", number), self.scene.base.parameters(core))
-        self._take("formed", AS_IT_IS, psnr)
+            write_store(self._file(FORMED, number), self.scene.base.parameters(core))
+        self._take(FORMED, AS_IT_IS, psnr)
 
     def _take(self, name: str, title: str, psnr: float) -> None:
         """Keep the splats of a candidate as the start, and delete the other candidates."""
         for number in range(len(self.scene.cores)):
             self._file(name, number).replace(start_file(self.scene.folder, number))
-            for other in CANDIDATES:
-                self._file(other, number).unlink(missing_ok=True)
+        for other in (*self.scene.folder.glob(f"{FORMED}_*.splats"), *self.scene.folder.glob(f"{MERGED}_*.splats")):
+            other.unlink()
         save_torch(self.scene.folder / START, {"name": title, "psnr": psnr}, overwrite=True)
 
 
 @torch.no_grad()
-def psnr(scene: TiledScene, splats: Splats, truths: Truths, views: Any) -> float:
-    """The mean PSNR (dB) of splats as the target shows them over views, of images and truths clamped as a display does (`validation.mean_db`)."""
+def quality(scene: TiledScene, splats: Splats, truths: Truths, views: Sequence[Camera]) -> Quality:
+    """The quality of splats as the target shows them over views, of images and truths clamped as a display does, as without tiles."""
     painter = scene.painter(scene.target)
     images = ((painter.image(splats, view.zoomed(scene.scale)), truths[view.name]) for view in views)
-    return mean_db([float((image.clamp(0, 1) - truth.clamp(0, 1)).square().mean()) for image, truth in images])
+    return Quality.of([[float((image.clamp(0, 1) - truth.clamp(0, 1)).square().mean()) for image, truth in images]])

@@ -21,7 +21,7 @@ from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.tiles.folder import START, start_file, steered_file, tile_file
 from mipmap_plugin.tiles.scene import TiledScene
 from mipmap_plugin.tiles.splats import Splats
-from mipmap_plugin.tiles.start import psnr
+from mipmap_plugin.tiles.start import quality
 from mipmap_plugin.tiles.store import Store
 from mipmap_plugin.tiles.sweeps import Sweep
 from mipmap_plugin.tiles.truth import Truths
@@ -78,7 +78,7 @@ def steer(scene: TiledScene, sweep: Sweep) -> None:
     warms_up = sweep.end <= scene.config.warm_up_steps  # rates that lose a little in a few steps may gain in many
     for step in sweep.checks:
         state = Steered(sweep.number, step)
-        psnrs.append(psnr(scene, open_state(scene, state), truths, scene.views.steering))
+        psnrs.append(quality(scene, open_state(scene, state), truths, scene.views.steering).psnr)
         if psnrs[-1] < (start_db if warms_up else best_db) - HARM_DB and scene.config.returns == "best":
             ceiling, harmful = RATE_REDUCTION * rate_factor(scene, step, ceiling), True
             break

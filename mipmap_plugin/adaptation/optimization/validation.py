@@ -68,6 +68,14 @@ class Quality(NamedTuple):
     visible: float  # as far as differences are visible: states are compared by it
     psnr: float  # what is told
 
+    @classmethod
+    def of(cls, errors: Sequence[Sequence[float]]) -> Quality:
+        """That of a state with these mean square errors of each view, per viewer, of which the worst viewer counts most.
+
+        The worst viewer alone would be too strict, as it may fall a little while all others improve; the mean PSNR would hide it.
+        """
+        return cls(*(decibel(fmean(10 ** (-mean(each) / 10) for each in errors)) for mean in (_visible_db, mean_db)))
+
 
 @dataclass(frozen=True)
 class Validation:
@@ -113,12 +121,8 @@ class Validation:
         return self.quality(model).visible
 
     def quality(self, model: SplatModel) -> Quality:
-        """The quality on the steering views, of the mean square error over viewers, in which the worst viewer counts most.
-
-        The worst viewer alone would be too strict, as it may fall a little while all others improve; the mean PSNR would hide it.
-        """
-        errors = self._errors(model, self.steering)
-        return Quality(*(decibel(fmean(10 ** (-mean(each) / 10) for each in errors)) for mean in (_visible_db, mean_db)))
+        """The quality on the steering views."""
+        return Quality.of(self._errors(model, self.steering))
 
     def choose(self, states: dict[str, SplatModel], allowed: Collection[str] | None = None) -> tuple[str, dict[str, float], dict[str, list[float]]]:
         """The state of the best visible quality, of those that are `allowed`, each state's PSNR in its worst viewer, and its visible dB of each view.
