@@ -9,6 +9,7 @@ from typing import Any
 from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.adaptation.optimization.amount import fewer_note
 from mipmap_plugin.adaptation.optimization.ending import End
+from mipmap_plugin.adaptation.optimization.validation import last_of_best
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report, filters, simulated, versions
 from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.errors import plural, warn
@@ -31,9 +32,9 @@ def judged(scene: TiledScene) -> tuple[dict[str, float], str]:
     truths, start = Truths(scene), f"the start, {load_torch(scene.folder / START)['name']}"
     first, last = (open_state(scene, state) for state in (Steered.before(scene.folder, 0), result(scene.folder)))
     states = {AS_IT_IS: scene.base, start: first, JOINED: last}
-    psnrs = {name: quality(scene, splats, truths, scene.views.choosing).psnr for name, splats in states.items()}
-    best = max(reversed(psnrs), key=psnrs.__getitem__)
-    return psnrs, JOINED if scene.config.returns == "last" else best
+    found = {name: quality(scene, splats, truths, scene.views.choosing) for name, splats in states.items()}
+    best = last_of_best({name: each.visible for name, each in found.items()}, AS_IT_IS)
+    return {name: each.psnr for name, each in found.items()}, JOINED if scene.config.returns == "last" else best
 
 
 def make_report(
@@ -81,7 +82,7 @@ def make_report(
 def _ended_by(scene: TiledScene, tiles: Sequence[Mapping[str, Any]], what: str) -> str:
     """Why the run ended: the whole reached its target, the time of a tile was over, or all steps were taken. `what`: its tiles and steps."""
     config, budget = scene.config, End.TIME.told(scene.config, 0)
-    if config.target_db is not None and result(scene.folder).psnr >= config.target_db:
+    if config.target_db is not None and result(scene.folder).quality.psnr >= config.target_db:
         return f"{End.TARGET.told(config, 0)}, {what}"
     if any(tile["ended_by"] == budget for tile in tiles):
         return f"{budget}, {what} at most"

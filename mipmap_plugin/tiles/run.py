@@ -172,7 +172,7 @@ def _adapted(scene: TiledScene, do: _Stages) -> list[dict[str, Any]]:
         number += 1
         sweep, state = sweep_of(scene, number), Steered.before(folder, number)
         _forget(scene, sweep, state, number)
-        if scene.config.target_db is not None and state.psnr >= scene.config.target_db:
+        if scene.config.target_db is not None and state.quality.psnr >= scene.config.target_db:
             break
     return facts
 

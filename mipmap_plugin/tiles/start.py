@@ -44,10 +44,10 @@ class StartSearch:
 
     @torch.no_grad()
     def run(self) -> None:
-        """Write the start of each tile, and `start.pt`: its name, and its PSNR on the steering views."""
+        """Write the start of each tile, and `start.pt`: its name, and its quality on the steering views."""
         config, base = self.scene.config, self.steer(self.scene.base)
         if not (self.forms or config.merge_to < 1):
-            return self._take_base(base.psnr)
+            return self._take_base(base)
         weights = self._measured()
         pool.release_to_system()
         self._write(FORMED, weights, 1.0)
@@ -56,10 +56,10 @@ class StartSearch:
             self.forms, formed = False, base
         bounds = Bounds(formed.psnr - config.merging_costs, base.visible, formed.psnr)
         if config.merge_to < 1 and (merged := self._merger(weights).strongest(bounds)):
-            return self._take(merged.made, start_name(self.forms, merged=True), merged.quality.psnr)
+            return self._take(merged.made, start_name(self.forms, merged=True), merged.quality)
         if not self.forms or formed.visible < base.visible:
-            return self._take_base(base.psnr)
-        self._take(FORMED, start_name(self.forms), formed.psnr)
+            return self._take_base(base)
+        self._take(FORMED, start_name(self.forms), formed)
 
     def _measured(self) -> Tensor:
         """[N]: the blend weights of the base's splats, in target pixels of a view, from as many views as show enough of them, as without tiles."""
@@ -160,18 +160,18 @@ class StartSearch:
             model.reshape(lambda gaussians: (gaussians.scales, matched))  # noqa: B023  # it is called at once
             write_store(self._file(name, number), model.parameters())
 
-    def _take_base(self, psnr: float) -> None:
+    def _take_base(self, found: Quality) -> None:
         for number, core in enumerate(self.scene.cores):
             write_store(self._file(FORMED, number), self.scene.base.parameters(core))
-        self._take(FORMED, AS_IT_IS, psnr)
+        self._take(FORMED, AS_IT_IS, found)
 
-    def _take(self, name: str, title: str, psnr: float) -> None:
+    def _take(self, name: str, title: str, found: Quality) -> None:
         """Keep the splats of a candidate as the start, and delete the other candidates."""
         for number in range(len(self.scene.cores)):
             self._file(name, number).replace(start_file(self.scene.folder, number))
         for other in (*self.scene.folder.glob(f"{FORMED}_*.splats"), *self.scene.folder.glob(f"{MERGED}_*.splats")):
             other.unlink()
-        save_torch(self.scene.folder / START, {"name": title, "psnr": psnr}, overwrite=True)
+        save_torch(self.scene.folder / START, {"name": title, "quality": list(found)}, overwrite=True)
 
 
 @torch.no_grad()

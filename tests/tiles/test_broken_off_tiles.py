@@ -13,6 +13,7 @@ import torch
 from cut_scenes import base_pictures
 
 from mipmap_plugin.adaptation.optimization.loop import adapt as real_adapt
+from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.errors import JobsFailed, OutputError, OutputExists, SceneError, SettingsError
 from mipmap_plugin.formats import staging
@@ -161,9 +162,9 @@ def test_a_run_that_is_interrupted_anywhere_goes_on_to_the_same_bytes(job, monke
     gains, real_steer = {0: [1.0] * 6, 1: [1.5, -9.0], 2: [2.0], 3: [3.0] * 2}, steering.steer
 
     def steer(scene, made):
-        start_db, own = torch.load(scene.folder / "start.pt")["psnr"], iter(gains[made.number])
+        start_db, own = torch.load(scene.folder / "start.pt")["quality"][0], iter(gains[made.number])
         with monkeypatch.context() as patched:
-            patched.setattr(steering, "psnr", lambda *_: start_db + next(own))
+            patched.setattr(steering, "quality", lambda *_: Quality(*[start_db + next(own)] * 2))
             real_steer(scene, made)
 
     monkeypatch.setattr("mipmap_plugin.tiles.job.steer", steer)

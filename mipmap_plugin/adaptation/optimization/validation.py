@@ -7,7 +7,7 @@ The other half is used once, at the end, to choose among the base as it is, the 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import fmean
@@ -131,10 +131,7 @@ class Validation:
         """
         errors = {name: self._errors(model, self.choosing) for name, model in states.items()}
         quality = {name: min(map(_visible_db, each)) for name, each in errors.items()}
-        among = [name for name in states if allowed is None or name in allowed]
-        best, first = max(quality[name] for name in among), next(iter(states))
-        least = max(best - TIE_DB, quality[first]) if first in among else best - TIE_DB
-        chosen = [name for name in among if quality[name] >= least][-1]
+        chosen = last_of_best({name: quality[name] for name in states if allowed is None or name in allowed}, next(iter(states)))
         by_view = {name: [_visible_db([fmean(one)]) for one in zip(*each, strict=True)] for name, each in errors.items()}
         return chosen, {name: min(map(mean_db, each)) for name, each in errors.items()}, by_view
 
@@ -152,6 +149,12 @@ def _drawing(
         return render.of(shared)
     drawn = dict(zip(cameras, render_views(shared, [(camera, render.effects) for camera in cameras]), strict=True))
     return lambda camera: drawn[camera].image
+
+
+def last_of_best(visible: Mapping[str, float], first: str) -> str:
+    """The last of the states that are as good as the best by these visible dB, but none that is worse than the `first`, which is what went in."""
+    least = max(max(visible.values()) - TIE_DB, visible.get(first, -math.inf))
+    return [name for name, db in visible.items() if db >= least][-1]
 
 
 def mean_db(errors: Sequence[float]) -> float:
