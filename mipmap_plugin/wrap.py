@@ -162,8 +162,9 @@ def _of_unknown_size(model: SplatModel, scene: Scene) -> str:
 
 def _warn_of_others(wrapped: Wrapped, scene: Scene) -> None:
     """Warn if the photographs of the scene whose cameras are given, in the model's frame, do not show what it does."""
+    color, exposures = wrapped.background, wrapped.model.traits.exposures
     try:
-        doubt = doubt_about([*scene.images], lambda camera: scene.image(camera, wrapped.background), wrapped.render, wrapped.background, "--cameras")
+        doubt = doubt_about([*scene.images], lambda camera: scene.image(camera, color), wrapped.render, color, "--cameras", exposures)
     except MipmapPluginError:  # such as a damaged photograph, which cameras do without
         return
     if doubt:
