@@ -15,7 +15,7 @@ from typing_extensions import TypedDict, Unpack
 from mipmap_plugin.adaptation.adapted import Adapted as Adapted
 from mipmap_plugin.adaptation.cameras_of_base import own_cameras, where
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
-from mipmap_plugin.adaptation.target.other_world import doubt_about
+from mipmap_plugin.adaptation.target.other_world import LOOK, doubt_about
 from mipmap_plugin.adaptation.target.photographs import placed
 from mipmap_plugin.backends import BACKENDS, device_for
 from mipmap_plugin.camera import Camera, digest_of, of_base_scale
@@ -164,7 +164,7 @@ def _warn_of_others(wrapped: Wrapped, scene: Scene) -> None:
     """Warn if the photographs of the scene whose cameras are given, in the model's frame, do not show what it does."""
     color, exposures = wrapped.background, wrapped.model.traits.exposures
     try:
-        doubt = doubt_about([*scene.images], lambda camera: scene.image(camera, color), wrapped.render, color, "--cameras", exposures)
+        doubt = doubt_about([*scene.images], lambda camera: scene.image(camera, color, LOOK), wrapped.render, color, "--cameras", exposures)
     except MipmapPluginError:  # such as a damaged photograph, which cameras do without
         return
     if doubt:
