@@ -97,7 +97,7 @@ def adapt(
         adapt_jobs = adapt_many if many.tiles is None else adapt_tiled
         return adapt_jobs(many, checkpoints, request, base, threads, json)
     [checkpoint] = checkpoints
-    wrapped = wrap(replace(base, checkpoint=checkpoint), threads)
+    wrapped = wrap(replace(base, checkpoint=checkpoint), threads, images)
     most = _most(wrapped, (splats, bytes), (checkpoint, output), (scale, viewer), settings)
     settings, requests = settings | without_none(most_splats=most), _requests(scale or _fitting(wrapped.model, most), viewer)
     files = _files(checkpoint, output, requests)

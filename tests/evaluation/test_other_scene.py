@@ -47,6 +47,12 @@ def test_evaluate_tells_of_photographs_of_another_scene(tmp_path, capsys, seed, 
     assert (DOUBT in capsys.readouterr().err) == told
 
 
+def test_photographs_whose_cameras_are_given_too_are_told_of_once(tmp_path, capsys):
+    base, images = tiny.ply(tmp_path / "base.ply"), str(tiny.scene(tmp_path / "scene", tiny.cameras(4, seed=9, split="test"), seed=5))
+    assert main(["evaluate", str(base), "--images", images, "--cameras", images, "--scale", "1/2", "--no-report"]) == 0
+    assert "".join(capsys.readouterr().err.split()).count("theymaybeofanotherscene") == 1
+
+
 def test_an_adapted_file_is_not_doubted_for_what_it_shows_at_another_scale(tmp_path, capsys):
     base, images = tiny.folder(tmp_path / "base"), tiny.scene(tmp_path / "scene", tiny.cameras(4, seed=9, split="test"))
     assert main(["adapt", str(base), "--scale", "1/4", "--recipe", "instant", "--output", str(tmp_path / "adapted")]) == 0
