@@ -16,6 +16,8 @@ from mipmap_plugin.adaptation.report import AS_IT_IS, Report
 from mipmap_plugin.adaptation.shown import refuse_blind, remarks, too_unlike
 from mipmap_plugin.adaptation.target.detail import unused_upsampler
 from mipmap_plugin.adaptation.warn import warn
+from mipmap_plugin.backends.base import Rendered
+from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import BackendUnavailable, JobsFailed, SceneError, SettingsError, some_of
 from mipmap_plugin.formats.atomic import delete, new_file, together, write_json
 from mipmap_plugin.formats.here import told_from_here
@@ -37,6 +39,7 @@ from mipmap_plugin.tiles.scene import TiledScene, close_opened, opened
 from mipmap_plugin.tiles.steering import Steered, open_state, result, sweep_of
 from mipmap_plugin.tiles.sweeps import Sweep
 from mipmap_plugin.tiles.truth import draw_base, parts
+from mipmap_plugin.wrap import warn_of_others
 
 # Does jobs, and yields the outcome of each: an engine of `mipmap_plugin.jobs`.
 Engine = Callable[[Sequence[Job]], Generator[Outcome, None, None]]
@@ -108,12 +111,20 @@ def _uncut_if_refused(jobs: Sequence[Job]) -> Iterator[None]:
 
 def _examine_views(jobs: Sequence[Job]) -> None:
     """Warn of what is wrong with views, as without tiles, but by a sample of the splats. Raises SettingsError for views that show nothing."""
+    if (first := _opened(jobs[0])).photographed:  # all jobs have one base
+        warn_of_others(first.wrapped, first.photographed, partial(_rendered, first))
     for scene in map(_opened, jobs):
         model, views, near = scene.wrapped.model, scene.views.adapted, scene.base_effects.near_plane
         refuse_blind(views, model, near, partial(draw_base, scene), scene.scale)
         orbit = not scene.wrapped.cameras or scene.config.views == "orbit"
         for remark in filter(None, [*remarks(views, model, near, orbit=orbit), too_unlike(views), unused_upsampler(scene.config, scene.scale)]):
             warn(remark)
+
+
+def _rendered(scene: TiledScene, camera: Camera, fraction: float, _: str) -> Rendered:
+    """The base's picture of a view at a fraction of its size, as of `FrozenBase.render` with the filter "scaled"."""
+    layer = scene.base_painter(fraction).draw(scene.base, camera)
+    return Rendered(layer.over(torch.tensor(scene.base_effects.background)), 1 - layer.transmittance[..., 0])
 
 
 def _adapted_and_saved(scene: TiledScene, stages: _Stages, began: float, threads: int | None) -> Joined:
