@@ -15,7 +15,7 @@ from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.pixel_size import mean_pixel_size
 from mipmap_plugin.adaptation.start.base_weights import BaseWeights
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
-from mipmap_plugin.adaptation.start.clock import start_clock
+from mipmap_plugin.adaptation.start.clock import Clock, start_clock
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import ROUNDS, matched_opacities
 from mipmap_plugin.adaptation.start.merging import Rounds, merge_down, merge_seen
@@ -70,7 +70,7 @@ def best_start(problems: Sequence[StartProblem]) -> tuple[SplatModel, str, list[
     for problem in problems:
         if not found or clock.allows("start"):
             with clock.timing("start"):
-                search = StartSearch(problem)
+                search = StartSearch(problem, clock.rest())
                 start, name = search.best()
             found.append((start, name if len(problems) == 1 or problem.coarse_base else f"{name} without the conversion", search.notes))
             del search  # which keeps memory
@@ -80,11 +80,10 @@ def best_start(problems: Sequence[StartProblem]) -> tuple[SplatModel, str, list[
 class StartSearch:
     """The candidates, and the choice among them by their PSNR on the steering views."""
 
-    def __init__(self, problem: StartProblem) -> None:
-        self._problem, self._rounds = problem, Rounds()
+    def __init__(self, problem: StartProblem, clock: Clock) -> None:
+        self._problem, self._clock, self._rounds = problem, clock, Rounds()
         self._least, self._crispness = 0.0, problem.config.crispness  # the fraction of the rows that stay, of a zoom-in how crisp it is
-        self._clock = start_clock(problem)
-        self._seen = BaseWeights(problem, self._clock)
+        self._seen = BaseWeights(problem, clock)
         self.notes = self._seen.notes
         self._alike = draws_alike(problem.base_effects, problem.target)
         self._forms = problem.config.closed_form
