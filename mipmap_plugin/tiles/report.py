@@ -82,7 +82,7 @@ def make_report(
 def _ended_by(scene: TiledScene, tiles: Sequence[Mapping[str, Any]], what: str) -> str:
     """Why the run ended: the whole reached its target, the time of a tile was over, or all steps were taken. `what`: its tiles and steps."""
     config, budget = scene.config, End.TIME.told(scene.config, 0)
-    if config.target_db is not None and result(scene.folder).quality.psnr >= config.target_db:
+    if tiles and config.target_db is not None and result(scene.folder).quality.psnr >= config.target_db:
         return f"{End.TARGET.told(config, 0)}, {what}"
     if any(tile["ended_by"] == budget for tile in tiles):
         return f"{budget}, {what} at most"

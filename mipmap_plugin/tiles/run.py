@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
@@ -37,7 +38,6 @@ from mipmap_plugin.tiles.plan import alone, claim, cut_for, lock_of, refuse
 from mipmap_plugin.tiles.report import JOINED, judged, make_report
 from mipmap_plugin.tiles.scene import TiledScene, close_opened, opened
 from mipmap_plugin.tiles.steering import Steered, open_state, result, sweep_of
-from mipmap_plugin.tiles.sweeps import Sweep
 from mipmap_plugin.tiles.truth import draw_base, parts
 from mipmap_plugin.wrap import warn_of_others
 
@@ -172,8 +172,8 @@ def _adapted(scene: TiledScene, do: _Stages) -> list[dict[str, Any]]:
     do("truth", [truth_file(folder, part) for part in range(parts(scene.used_views))])
     do("start", [folder / START])
     facts: list[dict[str, Any]] = []
-    sweep, number = sweep_of(scene, 0), 0
-    while sweep is not None:
+    number, target = 0, math.inf if scene.config.target_db is None else scene.config.target_db
+    while sweep := sweep_of(scene, number):
         runs = [run_file(folder, tile, number) for tile in tiles]
         if not sweep.repeats and not all(file.exists() for file in runs):
             do("layer", [layer_file(folder, tile, number) for tile in tiles], number)
@@ -181,16 +181,16 @@ def _adapted(scene: TiledScene, do: _Stages) -> list[dict[str, Any]]:
         facts += do("tile", runs, number)
         do("steering", [steered_file(folder, number)], number)
         number += 1
-        sweep, state = sweep_of(scene, number), Steered.before(folder, number)
-        _forget(scene, sweep, state, number)
-        if scene.config.target_db is not None and state.quality.psnr >= scene.config.target_db:
+        _forget(scene, number)
+        if Steered.before(folder, number).quality.psnr >= target:
             break
     return facts
 
 
-def _forget(scene: TiledScene, sweep: Sweep | None, state: Steered, made: int) -> None:
-    """Make room on the disk: of what `made` sweeps left, only what the next one, `sweep`, goes on with is needed."""
+def _forget(scene: TiledScene, made: int) -> None:
+    """Make room on the disk: of what `made` sweeps left, only what the next one goes on with is needed."""
     tiles, folder = range(len(scene.cores)), scene.folder
+    sweep, state = sweep_of(scene, made), Steered.before(folder, made)
     kept = {state.file(folder, tile) for tile in tiles}
     for number in range(made):  # and nothing of later sweeps, which an interrupted run has begun
         unneeded = {*folder.glob(f"tile_{number}_*.splats")} - kept
