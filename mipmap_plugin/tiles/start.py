@@ -45,13 +45,13 @@ class StartSearch:
     @torch.no_grad()
     def run(self) -> None:
         """Write the start of each tile, and `start.pt`: its name, and its quality on the steering views."""
-        config, base = self.scene.config, self.steer(self.scene.base)
+        config, base = self.scene.config, quality(self.scene, self.scene.base, self.truths)
         if not (self.forms or config.merge_to < 1):
             return self._take_base(base)
         weights = self._measured()
         pool.release_to_system()
         self._write(FORMED, weights, 1.0)
-        formed = self.steer(self._open(FORMED))
+        formed = quality(self.scene, self._open(FORMED), self.truths)
         if self.alike and formed.visible < base.visible:  # the filter itself is the better answer, for merged splats too, as without tiles
             self.forms, formed = False, base
         bounds = Bounds(formed.psnr - config.merging_costs, base.visible, formed.psnr)
@@ -79,14 +79,10 @@ class StartSearch:
             name = f"{MERGED}_{power:g}{'_coarsely' if coarsely else ''}"
             self._write(name, weights, config.merge_to**power, coarsely)
             splats = self._open(name)
-            return Candidate(name, self.steer(splats), len(splats))
+            return Candidate(name, quality(scene, splats, self.truths), len(splats))
 
         count, costs = sum(map(len, scene.cores)), Costs.of(config, scene.base_effects, scene.target)
         return Merger(merge, lambda power: math.ceil(config.merge_to**power * count), costs)
-
-    def steer(self, splats: Splats) -> Quality:
-        """The quality on the steering views."""
-        return quality(self.scene, splats, self.truths, self.scene.views.steering)
 
     def _file(self, name: str, number: int) -> Path:
         return self.scene.folder / f"{name}_{number}.splats"
@@ -174,9 +170,14 @@ class StartSearch:
         save_torch(self.scene.folder / START, {"name": title, "quality": list(found)}, overwrite=True)
 
 
+def quality(scene: TiledScene, splats: Splats, truths: Truths) -> Quality:
+    """The quality on the steering views, as without tiles."""
+    return Quality.of([errors_of(scene, splats, truths, scene.views.steering)])
+
+
 @torch.no_grad()
-def quality(scene: TiledScene, splats: Splats, truths: Truths, views: Sequence[Camera]) -> Quality:
-    """The quality of splats as the target shows them over views, of images and truths clamped as a display does, as without tiles."""
+def errors_of(scene: TiledScene, splats: Splats, truths: Truths, views: Sequence[Camera]) -> list[float]:
+    """The mean square error of each view of splats as the target shows them, of images and truths clamped as a display does, as without tiles."""
     painter = scene.painter(scene.target)
     images = ((painter.image(splats, view.zoomed(scene.scale)), truths[view.name]) for view in views)
-    return Quality.of([[float((image.clamp(0, 1) - truth.clamp(0, 1)).square().mean()) for image, truth in images]])
+    return [float((image.clamp(0, 1) - truth.clamp(0, 1)).square().mean()) for image, truth in images]

@@ -81,7 +81,7 @@ def steer(scene: TiledScene, sweep: Sweep) -> None:
     warms_up = sweep.end <= scene.config.warm_up_steps  # rates that lose a little in a few steps may gain in many
     for step in sweep.checks:
         state = Steered(sweep.number, step)
-        found = quality(scene, open_state(scene, state), truths, scene.views.steering)
+        found = quality(scene, open_state(scene, state), truths)
         checked.append(found.visible)
         if found.visible < (start.quality if warms_up else reached).visible - HARM_DB and scene.config.returns == "best":
             ceiling, harmful = RATE_REDUCTION * rate_factor(scene, step, ceiling), True

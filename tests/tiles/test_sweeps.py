@@ -22,7 +22,7 @@ from mipmap_plugin.screen_filters import DILATION
 from mipmap_plugin.tiles import steering
 from mipmap_plugin.tiles.folder import start_file
 from mipmap_plugin.tiles.run import adapt_in_tiles
-from mipmap_plugin.tiles.start import StartSearch, quality
+from mipmap_plugin.tiles.start import StartSearch, errors_of
 from mipmap_plugin.tiles.steering import Steered, sweep_of
 from mipmap_plugin.tiles.store import Store
 from mipmap_plugin.tiles.sweeps import Sweep, sweeps, views_of
@@ -126,7 +126,7 @@ def test_a_truth_brighter_than_white_is_judged_as_it_is_displayed():
     filled = lambda level: torch.full((2, 2, 3), level)  # noqa: E731
     painter = SimpleNamespace(image=lambda splats, view: filled(1.0))
     scene, [view] = SimpleNamespace(painter=lambda target: painter, target=None, scale=0.5), tiny.cameras(1)
-    assert quality(scene, None, {view.name: filled(1.1)}, [view]) == quality(scene, None, {view.name: filled(1.0)}, [view])
+    assert errors_of(scene, None, {view.name: filled(1.1)}, [view]) == errors_of(scene, None, {view.name: filled(1.0)}, [view])
 
 
 def test_a_run_is_cut_into_a_warm_up_and_sweeps():
