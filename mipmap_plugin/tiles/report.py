@@ -28,7 +28,7 @@ JOINED = "the joined tiles"
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Judgment:
     """How good each state of the whole is on views that nothing was adapted to."""
 
     validation: dict[str, float]  # dB
@@ -36,11 +36,11 @@ class Judgement:
     notes: list[str]  # what there is to say of views, in sentences
 
 
-def judged(scene: TiledScene) -> Judgement:
+def judged(scene: TiledScene) -> Judgment:
     """Compare the base, the start and the result on whole views."""
     views = scene.views.choosing
     if not views:
-        return Judgement({}, JOINED, [])
+        return Judgment({}, JOINED, [])
     truths, start = Truths(scene), f"the start, {load_torch(scene.folder / START)['name']}"
     first, last = (open_state(scene, state) for state in (Steered.before(scene.folder, 0), result(scene.folder)))
     states = {AS_IT_IS: scene.base, start: first, JOINED: last}
@@ -48,10 +48,10 @@ def judged(scene: TiledScene) -> Judgement:
     found = {name: Quality.of([each]) for name, each in errors.items()}
     validation = {name: each.psnr for name, each in found.items()}
     if scene.config.returns == "last":
-        return Judgement(validation, JOINED, [])
+        return Judgment(validation, JOINED, [])
     best = last_of_best({name: each.visible for name, each in found.items()}, AS_IT_IS)
     before, after = ([Quality.of([[error]]).visible for error in errors[name]] for name in (AS_IT_IS, best))
-    return Judgement(validation, best, worse_views(views, before, after, scene.scale))
+    return Judgment(validation, best, worse_views(views, before, after, scene.scale))
 
 
 def make_report(
@@ -59,7 +59,7 @@ def make_report(
     files: Sequence[Path],
     tiles: Sequence[Mapping[str, Any]],
     seconds: dict[str, float],
-    judgement: Judgement,
+    judgment: Judgment,
 ) -> Report:
     """The report of the whole. `files`: what it is made of; `tiles`: what there is to say of each in each sweep."""
     after = sum(read_header(file).vertex.count for file in files)
@@ -67,9 +67,9 @@ def make_report(
     steps = max((tile["step"] for tile in tiles), default=0)
     lost = [f"the extra columns {', '.join(scene.extras)} are dropped, since tiles hold none"] if scene.extras else []
     lost += [sentence for sentence in [unread(scene.viewer, model, files[0])] if sentence]
-    for note in [*judgement.notes, *lost]:
+    for note in [*judgment.notes, *lost]:
         warn(note)
-    db = judgement.validation.get(judgement.returned, 0.0)
+    db = judgment.validation.get(judgment.returned, 0.0)
     return Report(
         scale=scene.scale,
         base=scene.digest,
@@ -86,11 +86,11 @@ def make_report(
         gaussians_after=after,
         seconds=seconds,
         ended_by=_ended_by(scene, tiles, f"{plural(len(files), 'tile')} of {plural(steps, 'step')}"),
-        returned=judgement.returned,
-        validation=judgement.validation,
+        returned=judgment.returned,
+        validation=judgment.validation,
         curve=[CurvePoint(step=steps, seconds=seconds["total"], validation_db=db, gaussians=after)],
         versions=versions(),
-        notes=[*scene.doubts, *judgement.notes, *lost],
+        notes=[*scene.doubts, *judgment.notes, *lost],
     )
 
 

@@ -132,12 +132,12 @@ def _adapted_and_saved(scene: TiledScene, stages: _Stages, began: float, threads
     facts = _adapted(scene, stages)
     last = time.perf_counter()
     with announced("measuring the whole"), thread_pool.limited_for(scene.backend, threads):
-        judgement = judged(scene)
+        judgment = judged(scene)
     stages.seconds["validation"] = time.perf_counter() - last
     stages.seconds["total"] = time.perf_counter() - began
     with announced(f"writing {stages.job.target.name}"):
-        files = _write_parts(scene, judgement.returned)
-        report = make_report(scene, files, facts, stages.seconds, judgement)
+        files = _write_parts(scene, judgment.returned)
+        report = make_report(scene, files, facts, stages.seconds, judgment)
         saved = _save(scene, stages.job, files, Joined(stages.job.target, report, facts))
     close_opened()
     return saved

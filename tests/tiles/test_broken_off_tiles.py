@@ -24,7 +24,7 @@ from mipmap_plugin.models.reading import load_vanilla
 from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.tiles import plan, run, steering, tile
 from mipmap_plugin.tiles.folder import truth_file, work_folder
-from mipmap_plugin.tiles.report import Judgement
+from mipmap_plugin.tiles.report import Judgment
 from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
 from mipmap_plugin.tiles.store import Store
 from mipmap_plugin.tiles.sweeps import Sweep
@@ -114,7 +114,7 @@ def test_saving_the_base_leaves_the_starts_to_the_next_run(job, monkeypatch):
     """A run that is killed while the base is saved comes to the same result when it goes on."""
     folder = work_folder(job.target)
     with monkeypatch.context() as patched, pytest.raises(OSError, match="no space left"):
-        patched.setattr(run, "judged", lambda scene: Judgement({}, AS_IT_IS, []))
+        patched.setattr(run, "judged", lambda scene: Judgment({}, AS_IT_IS, []))
         patched.setattr(run, "_save", Mock(side_effect=OSError("no space left")))
         adapt_in_tiles(job, 2)
     starts = Store(folder / "start_0.splats").parameters()["opacities"]
