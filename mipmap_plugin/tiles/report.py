@@ -33,25 +33,25 @@ class Judgment:
 
     validation: dict[str, float]  # dB
     returned: str  # the name of the best, or of the last where the settings say so
-    notes: list[str]  # what there is to say of views, in sentences
+    notes: list[str]  # what there is to say of splats and views, in sentences
 
 
 def judged(scene: TiledScene) -> Judgment:
     """Compare the base, the start and the result on whole views."""
-    views = scene.views.choosing
+    views, start = scene.views.choosing, load_torch(scene.folder / START)
     if not views:
-        return Judgment({}, JOINED, [])
-    truths, start = Truths(scene), f"the start, {load_torch(scene.folder / START)['name']}"
+        return Judgment({}, JOINED, start["notes"])
+    truths = Truths(scene)
     first, last = (open_state(scene, state) for state in (Steered.before(scene.folder, 0), result(scene.folder)))
-    states = {AS_IT_IS: scene.base, start: first, JOINED: last}
+    states = {AS_IT_IS: scene.base, f"the start, {start['name']}": first, JOINED: last}
     errors = {name: errors_of(scene, splats, truths, views) for name, splats in states.items()}
     found = {name: Quality.of([each]) for name, each in errors.items()}
     validation = {name: each.psnr for name, each in found.items()}
     if scene.config.returns == "last":
-        return Judgment(validation, JOINED, [])
+        return Judgment(validation, JOINED, start["notes"])
     best = last_of_best({name: each.visible for name, each in found.items()}, AS_IT_IS)
     before, after = ([Quality.of([[error]]).visible for error in errors[name]] for name in (AS_IT_IS, best))
-    return Judgment(validation, best, worse_views(views, before, after, scene.scale))
+    return Judgment(validation, best, [*start["notes"], *worse_views(views, before, after, scene.scale)])
 
 
 def make_report(

@@ -12,6 +12,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS, pixel_size, views_for
 from mipmap_plugin.adaptation.report import AS_IT_IS
+from mipmap_plugin.adaptation.start.base_weights import note_on_hidden
 from mipmap_plugin.adaptation.start.blend_weights import may_show, whole_weights
 from mipmap_plugin.adaptation.start.candidates import start_name
 from mipmap_plugin.adaptation.start.closed_form import FormSettings, closed_form, draws_alike, filter_suffices
@@ -41,10 +42,12 @@ class StartSearch:
         self.alike = draws_alike(*effects)
         self.forms = scene.config.closed_form and not filter_suffices(*effects)
         self.views: list[Camera] = []  # those in which blend weights are measured, which `_measured` finds
+        self.shown: list[Tensor] = []  # which splats of each core views show (`may_show`), as far as it is found
+        self.notes: list[str] = []
 
     @torch.no_grad()
     def run(self) -> None:
-        """Write the start of each tile, and `start.pt`: its name, and its quality on the steering views."""
+        """Write the start of each tile, and `start.pt`: its name, its quality on the steering views, and notes on it."""
         config, base = self.scene.config, quality(self.scene, self.scene.base, self.truths)
         if not (self.forms or config.merge_to < 1):
             return self._take_base(base)
@@ -69,7 +72,23 @@ class StartSearch:
         self.views = evenly(scene.views.adapted, views_for(shown))
         if further := [view for view in self.views if view not in first]:
             weights = weights.lerp(painter.weighed(scene.base, further)[0], len(further) / (len(first) + len(further)))
-        return weights * scene.scale**2
+        weights, opacities, self.shown = weights * scene.scale**2, [], []
+        for core in scene.cores:
+            gaussians = scene.base.gaussians(core, colored=False)
+            _, whole = self._sizes(gaussians)
+            self.shown.append(may_show(weights[core], whole, gaussians.means, scene.views.adapted, self.views))
+            opacities.append(gaussians.opacities)
+        self.notes = note_on_hidden(torch.cat(self.shown), torch.cat(opacities))
+        return weights
+
+    def _pixel_size(self, means: Tensor) -> Tensor:
+        """Of a base pixel at means [N, 3], in world units, [N]."""
+        return pixel_size(means, self.scene.views.adapted, len(self.views))
+
+    def _sizes(self, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
+        """[N]: of a base pixel at each splat, and of the splat's weight if nothing hid it."""
+        pixel = self._pixel_size(gaussians.means)
+        return pixel, whole_weights(gaussians, pixel, self.scene.views.adapted, self.scene.base_effects, self.scene.scale)
 
     def _merger(self, weights: Tensor) -> Merger[str]:
         """Merges the base's splats, which have these blend weights [N], into candidates, which it names."""
@@ -92,40 +111,32 @@ class StartSearch:
 
     def _write(self, name: str, weights: Tensor, fraction: float, coarsely: bool = False) -> None:
         """Write the closed form of the base after merging each core down to a fraction; `coarsely`: even where too few splats share a pixel."""
-        cores = enumerate(self.scene.cores)
-        merged = [self._merged(self._file(name, number), core, weights[core], fraction, coarsely) for number, core in cores]
+        merged = [self._merged(name, number, weights[core], fraction, coarsely) for number, core in enumerate(self.scene.cores)]
         pool.release_to_system()
         if self.forms:
             self._match(name, *map(torch.cat, zip(*merged, strict=True)))
             pool.release_to_system()
 
-    def _merged(self, file: Path, core: Tensor, own: Tensor, fraction: float, coarsely: bool) -> tuple[Tensor, Tensor]:
+    def _merged(self, name: str, number: int, own: Tensor, fraction: float, coarsely: bool) -> tuple[Tensor, Tensor]:
         """Write a core's candidate, from its blend weights `own`; returns the candidate's, and those that it had if nothing hid it."""
         scene = self.scene
-        model = scene.for_target(scene.base.parameters(core))
+        model = scene.for_target(scene.base.parameters(scene.cores[number]))
         whole = torch.empty(0)
 
         def pixel_of(means: Tensor) -> Tensor:
-            return pixel_size(means, scene.views.adapted, len(self.views))
-
-        def sizes(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
-            """Of a base pixel at each splat, and of the splat's weight if nothing hid it."""
-            pixel = pixel_of(gaussians.means)
-            return pixel, whole_weights(gaussians, pixel, scene.views.adapted, scene.base_effects, scene.scale)
+            return self._pixel_size(means) / scene.scale
 
         def merged(gaussians: Gaussians) -> Gaussians:
             nonlocal own
             if coarsely:
-                splats, own = merge_down(gaussians, lambda means: pixel_of(means) / scene.scale, own, math.ceil(fraction * len(gaussians)))
-                return splats
-            pixel, before = sizes(gaussians)
-            seen = may_show(own, before, gaussians.means, scene.views.adapted, self.views)
-            splats, own = merge_seen(gaussians, pixel / scene.scale, own, fraction, seen)
+                splats, own = merge_down(gaussians, pixel_of, own, math.ceil(fraction * len(gaussians)))
+            else:
+                splats, own = merge_seen(gaussians, pixel_of(gaussians.means), own, fraction, self.shown[number])
             return splats
 
         def formed(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
             nonlocal whole
-            pixel, whole = sizes(gaussians)
+            pixel, whole = self._sizes(gaussians)
             form = FormSettings(area_power=1.0, views=len(self.views), pixel=pixel, matched=True)
             return closed_form(gaussians, scene.views.adapted, scene.scale, scene.base_effects, scene.target, form)
 
@@ -133,7 +144,7 @@ class StartSearch:
             model.rebuild(merged)
         if self.forms:
             model.reshape(formed)
-        write_store(file, model.parameters())
+        write_store(self._file(name, number), model.parameters())
         return own, whole
 
     def _match(self, name: str, wanted: Tensor, whole: Tensor) -> None:
@@ -167,7 +178,7 @@ class StartSearch:
             self._file(name, number).replace(start_file(self.scene.folder, number))
         for other in (*self.scene.folder.glob(f"{FORMED}_*.splats"), *self.scene.folder.glob(f"{MERGED}_*.splats")):
             other.unlink()
-        save_torch(self.scene.folder / START, {"name": title, "quality": list(found)}, overwrite=True)
+        save_torch(self.scene.folder / START, {"name": title, "quality": list(found), "notes": self.notes}, overwrite=True)
 
 
 def quality(scene: TiledScene, splats: Splats, truths: Truths) -> Quality:

@@ -94,6 +94,17 @@ def test_what_is_in_the_picture_but_not_seen_is_weighed_in_more_views(job):
     assert len(search.views) == 2 * LEAST_VIEWS
 
 
+def test_splats_that_no_view_shows_are_told_of(job):
+    """As without tiles: half of them lie far behind all cameras."""
+    shown = tiny.gaussians(80)
+    folder = job.base.checkpoint.with_name("hidden")
+    VanillaModel.from_gaussians(shown.joined(replace(shown, means=shown.means + 1000.0)), TrainedScale()).save(folder, provenance={})
+    write_cameras(folder / "cameras.json", tiny.cameras(3, width=20, height=16))
+    with pytest.warns(UserWarning, match="no view shows 5[0-9]% of the splats"):
+        report = adapt_in_tiles(replace(job, base=Base(folder)), 2).report
+    assert any("no view shows" in note for note in report.notes)
+
+
 def test_without_a_closed_form_merged_splats_keep_their_opacities(job, monkeypatch):
     """As without tiles, where they are matched in the closed form."""
     scene = cut_in_three(job, merge_to=0.5, closed_form=False)
