@@ -27,6 +27,7 @@ from mipmap_plugin.commands.list import list_
 from mipmap_plugin.commands.render import render
 from mipmap_plugin.commands.repeated import refuse_repeated
 from mipmap_plugin.commands.tradeoff import tradeoff
+from mipmap_plugin.commands.types import RULES
 from mipmap_plugin.commands.view import view
 from mipmap_plugin.errors import MipmapPluginError, MipmapPluginWarning, SettingsError, of_a_file
 from mipmap_plugin.formats.here import told_from_here
@@ -93,9 +94,9 @@ def _parse(words: Sequence[str]) -> None:
         refuse_repeated(command, words)
         prog, summary = f"mipmap-plugin {words[0]}", (getdoc(command) or "").partition("\n\nArgs:")[0]
         described = f"{summary}\n\nExample: {prog} {EXAMPLES[words[0]]}"
-        tyro.cli(_alone(command), prog=prog, description=described, args=words[1:], config=OPTIONS)
+        tyro.cli(_alone(command), prog=prog, description=described, args=words[1:], config=OPTIONS, registry=RULES)
     else:
-        app.cli(prog="mipmap-plugin", description=DESCRIPTION, args=words, config=OPTIONS)
+        app.cli(prog="mipmap-plugin", description=DESCRIPTION, args=words, config=OPTIONS, registry=RULES)
 
 
 def _at_home(word: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -15,9 +15,10 @@ from typing_extensions import TypedDict, Unpack
 from mipmap_plugin.adaptation.adapted import Adapted as Adapted
 from mipmap_plugin.adaptation.cameras_of_base import own_cameras, where
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
-from mipmap_plugin.adaptation.target.other_world import doubt_about
+from mipmap_plugin.adaptation.target.other_world import LOOK, doubt_about
 from mipmap_plugin.adaptation.target.photographs import placed
 from mipmap_plugin.backends import BACKENDS, device_for
+from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.camera import Camera, digest_of, of_base_scale
 from mipmap_plugin.errors import MipmapPluginError, SettingsError, warn
 from mipmap_plugin.frozen_base import FrozenBase
@@ -83,7 +84,7 @@ def wrap_model(
     """
     wrapped, scene = wrap_unchecked(model, cameras, backend, threads, **options)
     if cameras is not None and scene is not None:
-        _warn_of_others(wrapped, scene)
+        warn_of_others(wrapped, scene, wrapped.render)
     return wrapped
 
 
@@ -160,10 +161,11 @@ def _of_unknown_size(model: SplatModel, scene: Scene) -> str:
     return f"{size}, but {smaller}: if it was so, give a copy of the scene whose folder images has the photographs at that size"
 
 
-def _warn_of_others(wrapped: Wrapped, scene: Scene) -> None:
-    """Warn if the photographs of the scene whose cameras are given, in the model's frame, do not show what it does."""
+def warn_of_others(wrapped: Wrapped, scene: Scene, render: Callable[..., Rendered]) -> None:
+    """Warn if the photographs of the scene whose cameras are given, in the model's frame, do not show what it does, as drawn by `render`."""
+    color, exposures = wrapped.background, wrapped.model.traits.exposures
     try:
-        doubt = doubt_about([*scene.images], lambda camera: scene.image(camera, wrapped.background), wrapped.render, wrapped.background, "--cameras")
+        doubt = doubt_about([*scene.images], lambda camera: scene.image(camera, color, LOOK), render, color, "--cameras", exposures)
     except MipmapPluginError:  # such as a damaged photograph, which cameras do without
         return
     if doubt:

@@ -19,7 +19,7 @@ from mipmap_plugin.commands.tiled import adapt_tiled
 from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoints, Scale, ScreenFilter, Seed, Threads, Up, Viewer, unique_scales
 from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, plural
 from mipmap_plugin.formats.atomic import together
 from mipmap_plugin.formats.here import from_here
 from mipmap_plugin.jobs.base import Base
@@ -97,7 +97,7 @@ def adapt(
         adapt_jobs = adapt_many if many.tiles is None else adapt_tiled
         return adapt_jobs(many, checkpoints, request, base, threads, json)
     [checkpoint] = checkpoints
-    wrapped = wrap(replace(base, checkpoint=checkpoint), threads)
+    wrapped = wrap(replace(base, checkpoint=checkpoint), threads, images)
     most = _most(wrapped, (splats, bytes), (checkpoint, output), (scale, viewer), settings)
     settings, requests = settings | without_none(most_splats=most), _requests(scale or _fitting(wrapped.model, most), viewer)
     files = _files(checkpoint, output, requests)
@@ -241,7 +241,7 @@ def _made_for(report: Report, model: SplatModel, saved: Path) -> str:
 
 def _say(saved: Path, report: Report, model: SplatModel) -> None:
     """Two lines, what and where; the rest goes to the log."""
-    splats = f"{report.gaussians_before:,} -> {report.gaussians_after:,} splats, {report.seconds['total']:.1f} s"
+    splats = f"{report.gaussians_before:,} -> {plural(report.gaussians_after, 'splat')}, {report.seconds['total']:.1f} s"
     say(f"x{report.scale:g}{f' in {report.viewer}' if report.viewer else ''}: {report.gain()}, {splats}")
     say(f"{from_here(saved)}, {_made_for(report, model, saved)}")
     for line in _details(report):

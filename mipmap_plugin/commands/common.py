@@ -31,10 +31,10 @@ def this_command() -> str:
     return typed(["mipmap-plugin", *WORDS.get()])
 
 
-def wrap(base: Base, threads: int | None = None) -> Wrapped:
-    """Load and wrap a checkpoint, for whatever is done in this process. `threads`: for torch too. Raises what `Base.load` raises."""
+def wrap(base: Base, threads: int | None = None, images: Path | None = None) -> Wrapped:
+    """`Base.load`, for whatever is done in this process. `threads`: for torch too."""
     with announced(f"reading {base.checkpoint.name}"), uncollected():
-        wrapped = base.load(threads)
+        wrapped = base.load(threads, images)
         leave_loaded()
         if threads is not None:
             from mipmap_plugin.process.threads import limit_torch  # here, for it imports torch

@@ -80,7 +80,7 @@ def evaluate(
     with resumable(results.kept, "row"):
         for name, path, folder, own in zip(_names(checkpoint, images), checkpoint, images, cameras or [None] * len(checkpoint), strict=True):
             base = Base(path, own, background, backend, screen_filter)
-            wrapped, photographs = wrap(base, threads), _scene(base, folder, appearance)
+            wrapped, photographs = wrap(base, threads, folder), _scene(base, folder, appearance)
             results.refuse_output([*photographs.images.values()], overwrite)
             results.measure(name, wrapped, photographs, appearance, recipe, settings)
     facts = results.write(checkpoint, overwrite)

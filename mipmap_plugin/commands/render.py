@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 # Endings of pictures, which no folder is called by.
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr")
 
+# What a picture has beside it on request.
+OUTPUTS = ("depth", "normals")
+
 # The file in the folder of the pictures that has, until all are there, the sha256 of each that is finished; by a hash of what they depend on.
 RECORD = "render_{}.resume"
 
@@ -79,13 +82,13 @@ def render(
         wrapped.effects(zoom, filter_name, supersampling, viewer)  # check the options before any work
         if own_viewer is None:
             _tell_if_not_drawn(wrapped, viewer)
-    outputs = [name for name, requested in {"depth": depth, "normals": normals}.items() if requested]
+    outputs = [name for name, requested in zip(OUTPUTS, (depth, normals), strict=True) if requested]
     told = [replace(camera, name=f"{camera.name}_t{camera.time:g}") for camera in views] if len(time) > 1 else views
     pictures = [output / name for name in picture_names(told)]
     # Samples are clamped as `evaluate` clamps them, except those that an exposure may still bring into the range of a picture.
     options: RenderOptions = {"viewer": viewer, "filter_3d": filter_3d, "outputs": outputs, "exposure": exposure, "clamped": not exposure}
     record = output / RECORD.format(_hash(wrapped, views, (zoom, filter_name, supersampling, backend, options)))
-    finished = _finished(record, pictures)
+    finished = _finished(record, pictures, outputs)
     left = [(view, picture) for view, picture in zip(views, pictures, strict=True) if picture.name not in finished]
     _refuse(wrapped, [picture for _, picture in left], outputs, overwrite)
     _check(wrapped, views, exposure)
@@ -179,13 +182,15 @@ def _hash(wrapped: Wrapped, views: Sequence[Camera], how: tuple[Any, ...]) -> st
     return hashlib.sha256(json.dumps(facts, sort_keys=True, default=str).encode()).hexdigest()[:DIGITS]
 
 
-def _finished(record: Path, pictures: Sequence[Path]) -> dict[str, str]:
-    """The names of the pictures that the same command finished before it was interrupted, each with its sha256; none that was replaced since."""
+def _finished(record: Path, pictures: Sequence[Path], outputs: Sequence[str]) -> dict[str, str]:
+    """The names of the pictures that the same command finished before it was interrupted, each with its sha256; none that was replaced since, or
+    whose other outputs are gone."""
     try:
         told = json.loads(settled(record).read_text(encoding="utf-8"))["finished"]
     except (OSError, ValueError):  # none, or cut off by a crash of the machine
         return {}
-    return {each.name: told[each.name] for each in pictures if each.name in told and each.is_file() and sha256(each) == told[each.name]}
+    whole = [each for each in pictures if all(path.is_file() for path in (each, *(_beside(each, name) for name in outputs)))]
+    return {each.name: told[each.name] for each in whole if each.name in told and sha256(each) == told[each.name]}
 
 
 @contextmanager
@@ -213,10 +218,10 @@ def _refuse(wrapped: Wrapped, pictures: Sequence[Path], outputs: Sequence[str], 
 
 
 def _write(picture: Path, rendered: Rendered, outputs: Sequence[str], overwrite: bool, record: Path, finished: dict[str, str]) -> None:
-    """Write a picture and its other outputs, and that it is finished: all of it or nothing."""
+    """Write a picture and its other outputs, and that it is finished: all of it or nothing. Those of a picture that it replaces go."""
     from mipmap_plugin.formats.images import write_array, write_image
 
-    with together(record):
+    with together(record, [_beside(picture, name) for name in OUTPUTS if overwrite and name not in outputs]):
         write_image(picture, rendered.image, overwrite=overwrite)
         for name in outputs:
             write_array(_beside(picture, name), getattr(rendered, name), overwrite=overwrite)

@@ -48,7 +48,7 @@ def adapt_tiled(many: Many, given: Sequence[Path], request: Request, base: Base,
 
 def _say(job: Job, tiles: int, joined: Joined) -> None:
     report = joined.report
-    splats = f"{report.gaussians_before:,} -> {report.gaussians_after:,} splats"
+    splats = f"{report.gaussians_before:,} -> {plural(report.gaussians_after, 'splat')}"
     viewer = f" in {job.viewer}" if job.viewer else ""
     say(f"x{job.scale:g}{viewer}, {plural(tiles, 'tile')}: {report.gain()}, {splats}, {report.seconds['total']:.1f} s")
     say(from_here(joined.file))

@@ -6,7 +6,8 @@ import re
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from types import NoneType
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import tyro
 
@@ -39,6 +40,27 @@ def read_viewer(text: str) -> str:
 
     names = {*VIEWERS.names(), *NO_RECORD}
     return text if text in names or text.lower() not in names else text.lower()
+
+
+# What options are read by, beside tyro's own rules.
+RULES = tyro.constructors.ConstructorRegistry()
+
+
+@RULES.primitive_rule
+def _one_of(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+    """One of several names, or none: tyro tells those of a union in another order each time, and None, which nobody types, among them."""
+    kinds = [kind for kind in get_args(info.type) if kind is not NoneType]
+    if not kinds or any(get_origin(kind) is not Literal for kind in kinds):
+        return None
+    names = tuple(name for kind in kinds for name in get_args(kind))
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=f"{{{','.join(names)}}}",
+        instance_from_str=lambda words: words[0],
+        is_instance=lambda value: value is None or value in names,
+        str_from_instance=lambda value: [str(value)],
+        choices=names,
+    )
 
 
 _SCALE = tyro.constructors.PrimitiveConstructorSpec[Any](

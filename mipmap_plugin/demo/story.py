@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from mipmap_plugin.errors import plural
 from mipmap_plugin.evaluation.evaluate import Row
 from mipmap_plugin.formats.here import from_here
 
@@ -22,7 +23,7 @@ def story(rows: Sequence[Row], viewer: str | None, seconds: float, output: Path,
         base, adapted = by_name[scale, "base"], by_name[scale, "adapted"]
         fault = f" ({ZOOMED_OUT if scale < 1 else ZOOMED_IN})" if scale != 1 else ""
         change = f"base {base.psnr_db:.1f} dB{fault} -> adapted {adapted.psnr_db:.1f} dB"
-        lines.append(f"  {_zoom(scale):5}{change}, {base.gaussians:,} -> {adapted.gaussians:,} splats, in {adapted.adapt_seconds:.0f} s")
+        lines.append(f"  {_zoom(scale):5}{change}, {base.gaussians:,} -> {plural(adapted.gaussians, 'splat')}, in {adapted.adapt_seconds:.0f} s")
     lines.append(f"All of it took {seconds:.0f} s. Files and pictures (base | adapted | truth): {from_here(output)}")
     return "\n".join([*lines, *([f"page: {from_here(page)}"] if page else [])])
 

@@ -28,9 +28,9 @@ READY_MADE = re.compile(r"images(_\d+)?$")
 # this is resized.
 ROUNDING = 4
 
-# Base pixels: the base's size is rounded, and then that of a view by the ratio of the widths (`at_density_of`), so that at a zoom-in a view may have
-# by so many more than its photograph shows: half a pixel, and half of one times the ratio of the sides. Mip-NeRF 360's bicycle of 4946 x 3286 px,
-# trained at an eighth, is 618 x 411 px, of which x8 makes 4944 x 3288.
+# Base pixels by which a view may be larger than its photograph shows. A training rounds the size of its pictures, by half a pixel, and a view of
+# another field has its density from one of these (`at_density_of`): up to a whole pixel for twice the size, and half of one for its own rounding.
+# Mip-NeRF 360's bicycle of 4946 x 3286 px, trained at an eighth, is 618 x 411 px, of which x8 makes 4944 x 3288.
 ROUNDED_UP = 1.5
 
 

@@ -21,7 +21,8 @@ def of_another_scene(model: Wrapped, views: Sequence[TruthView], scale: float, p
     """That the base does not show what the photographs do, in a sentence (`doubt_about`); "" if it does."""
     truths = {view.camera: view for view in views}
     masks = ", whose transparent parts count as background" if any(isinstance(view, JudgedView) and view.transparent for view in views) else ""
-    return doubt_about([*truths], lambda camera: truths[camera].truth(scale, protocol), model.render, model.background, f"--images{masks}")
+    option, exposures = f"--images{masks}", model.model.traits.exposures
+    return doubt_about([*truths], lambda camera: truths[camera].truth(scale, protocol), model.render, model.background, option, exposures)
 
 
 def of_another_size(model: Wrapped, scene: Scene) -> str:

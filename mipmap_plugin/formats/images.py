@@ -39,13 +39,14 @@ TOGETHER = 2**18
 UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 
 
-def read_image(path: str | Path, background: Sequence[float]) -> Tensor:
+def read_image(path: str | Path, background: Sequence[float], least: int | None = None) -> Tensor:
     """A PNG or JPEG file as [H, W, 3] float32 in 0..1; transparency shows `background` (RGB in 0..1).
 
+    `least`: px; a JPEG whose sides are both longer may be read smaller, by a power of two, which saves most of the time of a large one.
     EXIF rotation is not applied: cameras are calibrated on the pixels as they are stored. Raises SceneError, also for more pixels
     than the memory holds, or than a file of that size can have.
     """
-    pixels = _pixels(path)
+    pixels = _pixels(path, least)
     if pixels.dtype != np.uint8:
         return torch.from_numpy(pixels)
     if pixels.shape[2] == 4:
@@ -65,13 +66,15 @@ def has_alpha(path: str | Path) -> bool:
         return image.mode not in GRAY_16_BIT and image.has_transparency_data
 
 
-def _pixels(path: str | Path) -> np.ndarray:
+def _pixels(path: str | Path, least: int | None = None) -> np.ndarray:
     """A file's RGB or straight-alpha RGBA in 8 bits, [H, W, 3 or 4]; of 16 bits gray in 0..1, float32 [H, W, 3]. Raises SceneError."""
     with _opened(path) as image:
         _refuse_bomb(Path(path), *image.size)
         if image.mode == "F":  # Pillow would take them for levels of 0 to 255
             raise SceneError(f"{path}: its pixels are floats, which do not say what is white; save it with 8 or 16 bits")
         try:
+            if least is not None:
+                image.draft(None, (least, least))
             if image.mode in GRAY_16_BIT:
                 gray = np.asarray(image).astype(np.float32) / np.float32(65535)
                 return np.repeat(gray[..., None], 3, axis=2)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
-from mipmap_plugin.errors import CheckpointError, SettingsError
+from mipmap_plugin.errors import CheckpointError, SettingsError, plural
 from mipmap_plugin.formats.atomic import new_file
 from mipmap_plugin.formats.magic import read_head
 
@@ -210,7 +210,7 @@ def _sized(path: Path, header: Header, size: int) -> Header:
     held = max(0, available - taken) // header.least_bytes(vertex)
     if held < vertex.count:
         raise CheckpointError(
-            f"{path} is truncated: its header declares {vertex.count:,} splats, but at least {vertex.count - held:,} of them are missing;"
+            f"{path} is truncated: its header declares {plural(vertex.count, 'splat')}, but at least {vertex.count - held:,} of them are missing;"
             " download or copy it again"
         )
     if header.format == "ascii" or any(element.has_lists for element in header.elements):

@@ -62,15 +62,20 @@ class Base:
         except (CheckpointError, OSError):  # whoever loads it says so
             return self
 
-    def load(self, threads: int | None = None) -> Wrapped:
-        """Load and wrap the checkpoint. Raises CheckpointError, SceneError, SettingsError, BackendUnavailable."""
+    def load(self, threads: int | None = None, images: Path | None = None) -> Wrapped:
+        """Load and wrap the checkpoint. Raises CheckpointError, SceneError, SettingsError, BackendUnavailable.
+
+        `images`: the scene with whose photographs it is compared later, which is not done here if its cameras are theirs.
+        """
         folder = self._model_folder()  # says what is wrong with the checkpoint before torch is imported
         with uncollected():
-            from mipmap_plugin.wrap import WrapOptions, check_serves, wrap_model
+            from mipmap_plugin.wrap import WrapOptions, check_serves, wrap_model, wrap_unchecked
 
             check_serves(self.backend, threads)
             scene = self._given_scene(folder)  # before the splats, which take longer to read
             told: WrapOptions = {"background": COLORS[self.background], "screen_filter": self.screen_filter, "up": self.up}
+            if scene is not None and self.cameras == images:
+                return wrap_unchecked(self.checkpoint, scene, self.backend, threads, **told)[0]
             return wrap_model(self.checkpoint, cameras=scene, backend=self.backend, threads=threads, **told)
 
     def _model_folder(self) -> Path | None:

@@ -24,7 +24,7 @@ from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import WRITTEN
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.jobs.job import Job
-from mipmap_plugin.models import detect
+from mipmap_plugin.models import detect, load_model
 from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes.orbits import Orbit
@@ -105,4 +105,4 @@ def _fits(resize: str, cameras: Sequence[Camera], job: Job) -> bool:
 def _digest(job: Job, wanted: Any, may_load: bool) -> str:
     """The hash of the base checkpoint: of its file where that is `wanted`, otherwise, if it may be loaded, as its family computes it."""
     digest = sha256(detect(job.base.checkpoint).path)
-    return digest if digest == wanted or not may_load else job.base.load().model.digest
+    return digest if digest == wanted or not may_load else load_model(job.base.checkpoint).digest

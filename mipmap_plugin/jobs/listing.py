@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from mipmap_plugin.errors import CheckpointError, SettingsError
-from mipmap_plugin.formats.atomic import refuse_named_pipe
+from mipmap_plugin.formats.atomic import absolute, refuse_named_pipe
 
 Item = TypeVar("Item")
 
@@ -37,7 +37,7 @@ def find_checkpoints(given: Iterable[Path]) -> list[Path]:
     found: dict[Path, Path] = {}
     for path in given:
         for each in _matches(path) if is_pattern(path) else [path]:
-            found.setdefault(each.resolve(), each)
+            found.setdefault(absolute(each), each)
     return list(found.values())
 
 

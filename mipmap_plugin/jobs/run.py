@@ -45,7 +45,7 @@ def _finished_before(job: Job) -> Outcome | None:
 
 
 def _adapt(job: Job, threads: int | None) -> Outcome:
-    base = job.base.load(threads)
+    base = job.base.load(threads, job.images)
     base.keeps_images = False
     config = job.config()
     base.targets(job.viewer)

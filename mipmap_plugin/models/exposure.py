@@ -51,11 +51,19 @@ class Exposures:
         """The matrix [3, 4] float64 of the image with the name of `camera`, with or without suffix. Raises SettingsError if there is none."""
         if not self.matrices:
             raise SettingsError(f"exposure: {self.summary()}; leave it out")
-        matrix = self.matrices.get(camera.name, self._without_suffix.get(camera.name))
+        matrix = self._known(camera)
         if matrix is None:
             some = ", ".join(list(self.matrices)[:5])
             raise SettingsError(f"view {camera.name!r} has no exposure; the first of {len(self.matrices)} that have one are {some}")
         return matrix
+
+    def applied(self, image: Tensor, camera: Camera) -> Tensor:
+        """`image` [..., 3] as the photograph of `camera` was exposed; as it is, where that is not known."""
+        matrix = self._known(camera)
+        return image if matrix is None else exposed(image, matrix)
+
+    def _known(self, camera: Camera) -> Tensor | None:
+        return self.matrices.get(camera.name, self._without_suffix.get(camera.name))
 
     def summary(self) -> str:
         """A summary, as the beginning of a sentence."""
@@ -81,7 +89,7 @@ def read_exposures(folder: Path | None) -> Exposures:
 
 
 def exposed(image: Tensor, matrix: Tensor) -> Tensor:
-    """Apply an exposure E to `image` [H, W, 3]: each color as a row times E[:, :3], plus E[:, 3] (gaussian_renderer of 3DGS). Not clamped."""
+    """Apply an exposure E to `image` [..., 3]: each color as a row times E[:, :3], plus E[:, 3] (gaussian_renderer of 3DGS). Not clamped."""
     matrix = matrix.to(image)
     return image @ matrix[:, :3] + matrix[:, 3]
 

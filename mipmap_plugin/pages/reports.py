@@ -9,6 +9,7 @@ import torch
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.report import versions
+from mipmap_plugin.errors import plural
 from mipmap_plugin.evaluation.evaluate import Row, shown_as
 from mipmap_plugin.evaluation.measure import BASE, RESIZED, baselines
 from mipmap_plugin.evaluation.report import records
@@ -107,4 +108,5 @@ def _in_seconds(adapted: Picture, scale: float, rows: Sequence[Row]) -> str:
 def _gain(zoom: Zoom, report: dict[str, Any]) -> str:
     before, after = (next(each.mean.get("psnr_db") for each in zoom.pictures if each.role == role) for role in ("base", "adapted"))
     gain = f"{before:.1f} → {after:.1f} dB on views that nothing was adapted to, " if before is not None and after is not None else ""
-    return f"{report['title']}: {gain}{report['seconds']['total']:.1f} s, {report['gaussians_before']:,} → {report['gaussians_after']:,} splats."
+    splats = f"{report['gaussians_before']:,} → {plural(report['gaussians_after'], 'splat')}"
+    return f"{report['title']}: {gain}{report['seconds']['total']:.1f} s, {splats}."

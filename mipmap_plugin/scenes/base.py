@@ -143,14 +143,16 @@ class Scene:
         across, down = camera.width / whole.width, camera.height / whole.height
         return max(1, round(size[0] * across)), max(1, round(size[1] * down))
 
-    def image(self, camera: Camera, background: Sequence[float]) -> Tensor:
-        """The photograph of `camera` on `background` (RGB in 0..1), [H, W, 3] float32 at the file's full resolution, undistorted.
+    def image(self, camera: Camera, background: Sequence[float], least: int | None = None) -> Tensor:
+        """The photograph of `camera` on `background` (RGB in 0..1), [H, W, 3] float32, undistorted, at the file's full resolution.
+
+        `least`: it may be smaller, as of `read_image`.
 
         Raises SceneError if there is none: cameras are compared by identity, so a zoomed copy has none.
         """
         if camera not in self.images:
             raise SceneError(f"{self.source}: camera {camera.name!r} has no image; ask with a camera that is a key of `images`")
-        image, lens = read_image(self.images[camera], background), self.lenses.get(self.images[camera])
+        image, lens = read_image(self.images[camera], background, least), self.lenses.get(self.images[camera])
         return image if lens is None else lens.undistorted(image)
 
 

@@ -119,7 +119,7 @@ def _warn_of_larger(path: Path, read: int) -> None:
     count, largest = max(((_count(model), model) for model in others), key=lambda found: found[0], default=(0, first))
     if count > read:
         advice = f"{largest} has {count}: if a checkpoint was trained on that, give that folder"
-        warn(f"{first} is read, which has {read} images, but {advice}")
+        warn(f"{first} is read, which has {plural(read, 'image')}, but {advice}")
 
 
 def _count(model: Path) -> int:

@@ -41,7 +41,7 @@ def new_pictures(path: Path) -> Iterator[Callable[[str, Tensor, Box | None], Non
     with new_file(path, overwrite=True) as temporary, temporary.open("wb") as file:
 
         def write(name: str, picture: Tensor, box: Box | None) -> None:
-            table[name] = (file.tell(), list(picture.shape), names[picture.dtype], box)
+            table[name] = (file.tell(), picture.shape, names[picture.dtype], box or (0, 0, picture.shape[1], picture.shape[0]))
             file.write(picture.contiguous().view(-1).view(torch.uint8).numpy().tobytes())
 
         yield write
@@ -80,8 +80,4 @@ def _table(path: Path) -> dict[str, _Entry]:
         (start,) = END.unpack(file.read(END.size))
         file.seek(start)
         table = json.loads(file.read(end - start))
-    entries = {}
-    for name, (start, shape, kind, box) in table.items():
-        left, top, right, bottom = box or (0, 0, shape[1], shape[0])
-        entries[name] = _Entry(path, start, tuple(shape), kind, (left, top, right, bottom))
-    return entries
+    return {name: _Entry(path, start, tuple(shape), kind, tuple(box)) for name, (start, shape, kind, box) in table.items()}

@@ -25,7 +25,7 @@ from mipmap_plugin.tiles.folder import BASE, CUT, FEWEST, work_folder
 from mipmap_plugin.tiles.reading import find_splats, make_cut
 
 # Of the folder's files: those of another format are not gone on with.
-FORMAT = 6
+FORMAT = 7
 
 
 def refuse(job: Job, tiles: int) -> None:

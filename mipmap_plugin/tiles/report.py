@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.adaptation.optimization.amount import fewer_note
 from mipmap_plugin.adaptation.optimization.ending import End
+from mipmap_plugin.adaptation.optimization.validation import Quality, last_of_best
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report, filters, simulated, versions
+from mipmap_plugin.adaptation.shown import worse_views
 from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.errors import plural, warn
 from mipmap_plugin.formats.ply import read_header
@@ -17,23 +20,38 @@ from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.models.loaders import unread
 from mipmap_plugin.tiles.folder import START
 from mipmap_plugin.tiles.scene import TiledScene
-from mipmap_plugin.tiles.start import psnr
+from mipmap_plugin.tiles.start import errors_of
 from mipmap_plugin.tiles.steering import Steered, open_state, result
 from mipmap_plugin.tiles.truth import Truths
 
 JOINED = "the joined tiles"
 
 
-def judged(scene: TiledScene) -> tuple[dict[str, float], str]:
-    """The PSNR (dB) of each on whole views, and the name of what is returned: the best, or the last where the settings say so."""
-    if not scene.views.choosing:
-        return {}, JOINED
-    truths, start = Truths(scene), f"the start, {load_torch(scene.folder / START)['name']}"
+@dataclass(frozen=True)
+class Judgment:
+    """How good each state of the whole is on views that nothing was adapted to."""
+
+    validation: dict[str, float]  # dB
+    returned: str  # the name of the best, or of the last where the settings say so
+    notes: list[str]  # what there is to say of splats and views, in sentences
+
+
+def judged(scene: TiledScene) -> Judgment:
+    """Compare the base, the start and the result on whole views."""
+    views, start = scene.views.choosing, load_torch(scene.folder / START)
+    if not views:
+        return Judgment({}, JOINED, start["notes"])
+    truths = Truths(scene)
     first, last = (open_state(scene, state) for state in (Steered.before(scene.folder, 0), result(scene.folder)))
-    states = {AS_IT_IS: scene.base, start: first, JOINED: last}
-    psnrs = {name: psnr(scene, splats, truths, scene.views.choosing) for name, splats in states.items()}
-    best = max(reversed(psnrs), key=psnrs.__getitem__)
-    return psnrs, JOINED if scene.config.returns == "last" else best
+    states = {AS_IT_IS: scene.base, f"the start, {start['name']}": first, JOINED: last}
+    errors = {name: errors_of(scene, splats, truths, views) for name, splats in states.items()}
+    found = {name: Quality.of([each]) for name, each in errors.items()}
+    validation = {name: each.psnr for name, each in found.items()}
+    if scene.config.returns == "last":
+        return Judgment(validation, JOINED, start["notes"])
+    best = last_of_best({name: each.visible for name, each in found.items()}, AS_IT_IS)
+    before, after = ([Quality.of([[error]]).visible for error in errors[name]] for name in (AS_IT_IS, best))
+    return Judgment(validation, best, [*start["notes"], *worse_views(views, before, after, scene.scale)])
 
 
 def make_report(
@@ -41,19 +59,17 @@ def make_report(
     files: Sequence[Path],
     tiles: Sequence[Mapping[str, Any]],
     seconds: dict[str, float],
-    validation: dict[str, float],
-    returned: str,
+    judgment: Judgment,
 ) -> Report:
-    """The report of the whole. `files`: what it is made of; `tiles`: what there is to say of each in each sweep; `validation`: dB of each state on
-    views that nothing was adapted to."""
+    """The report of the whole. `files`: what it is made of; `tiles`: what there is to say of each in each sweep."""
     after = sum(read_header(file).vertex.count for file in files)
     model, config = scene.wrapped.model, scene.config
     steps = max((tile["step"] for tile in tiles), default=0)
     lost = [f"the extra columns {', '.join(scene.extras)} are dropped, since tiles hold none"] if scene.extras else []
     lost += [sentence for sentence in [unread(scene.viewer, model, files[0])] if sentence]
-    for note in lost:
+    for note in [*judgment.notes, *lost]:
         warn(note)
-    last = CurvePoint(step=steps, seconds=seconds["total"], validation_db=validation.get(returned, 0.0), gaussians=after)
+    db = judgment.validation.get(judgment.returned, 0.0)
     return Report(
         scale=scene.scale,
         base=scene.digest,
@@ -70,18 +86,18 @@ def make_report(
         gaussians_after=after,
         seconds=seconds,
         ended_by=_ended_by(scene, tiles, f"{plural(len(files), 'tile')} of {plural(steps, 'step')}"),
-        returned=returned,
-        validation=validation,
-        curve=[last],
+        returned=judgment.returned,
+        validation=judgment.validation,
+        curve=[CurvePoint(step=steps, seconds=seconds["total"], validation_db=db, gaussians=after)],
         versions=versions(),
-        notes=[*scene.doubts, *lost],
+        notes=[*scene.doubts, *judgment.notes, *lost],
     )
 
 
 def _ended_by(scene: TiledScene, tiles: Sequence[Mapping[str, Any]], what: str) -> str:
     """Why the run ended: the whole reached its target, the time of a tile was over, or all steps were taken. `what`: its tiles and steps."""
     config, budget = scene.config, End.TIME.told(scene.config, 0)
-    if config.target_db is not None and result(scene.folder).psnr >= config.target_db:
+    if tiles and config.target_db is not None and result(scene.folder).quality.psnr >= config.target_db:
         return f"{End.TARGET.told(config, 0)}, {what}"
     if any(tile["ended_by"] == budget for tile in tiles):
         return f"{budget}, {what} at most"

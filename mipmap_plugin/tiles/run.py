@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,6 +17,8 @@ from mipmap_plugin.adaptation.report import AS_IT_IS, Report
 from mipmap_plugin.adaptation.shown import refuse_blind, remarks, too_unlike
 from mipmap_plugin.adaptation.target.detail import unused_upsampler
 from mipmap_plugin.adaptation.warn import warn
+from mipmap_plugin.backends.base import Rendered
+from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import BackendUnavailable, JobsFailed, SceneError, SettingsError, some_of
 from mipmap_plugin.formats.atomic import delete, new_file, together, write_json
 from mipmap_plugin.formats.here import told_from_here
@@ -35,8 +38,8 @@ from mipmap_plugin.tiles.plan import alone, claim, cut_for, lock_of, refuse
 from mipmap_plugin.tiles.report import JOINED, judged, make_report
 from mipmap_plugin.tiles.scene import TiledScene, close_opened, opened
 from mipmap_plugin.tiles.steering import Steered, open_state, result, sweep_of
-from mipmap_plugin.tiles.sweeps import Sweep
 from mipmap_plugin.tiles.truth import draw_base, parts
+from mipmap_plugin.wrap import warn_of_others
 
 # Does jobs, and yields the outcome of each: an engine of `mipmap_plugin.jobs`.
 Engine = Callable[[Sequence[Job]], Generator[Outcome, None, None]]
@@ -108,6 +111,8 @@ def _uncut_if_refused(jobs: Sequence[Job]) -> Iterator[None]:
 
 def _examine_views(jobs: Sequence[Job]) -> None:
     """Warn of what is wrong with views, as without tiles, but by a sample of the splats. Raises SettingsError for views that show nothing."""
+    if (first := _opened(jobs[0])).photographed:  # all jobs have one base
+        warn_of_others(first.wrapped, first.photographed, partial(_rendered, first))
     for scene in map(_opened, jobs):
         model, views, near = scene.wrapped.model, scene.views.adapted, scene.base_effects.near_plane
         refuse_blind(views, model, near, partial(draw_base, scene), scene.scale)
@@ -116,17 +121,23 @@ def _examine_views(jobs: Sequence[Job]) -> None:
             warn(remark)
 
 
+def _rendered(scene: TiledScene, camera: Camera, fraction: float, _: str) -> Rendered:
+    """The base's picture of a view at a fraction of its size, as of `FrozenBase.render` with the filter "scaled"."""
+    layer = scene.base_painter(fraction).draw(scene.base, camera)
+    return Rendered(layer.over(torch.tensor(scene.base_effects.background)), 1 - layer.transmittance[..., 0])
+
+
 def _adapted_and_saved(scene: TiledScene, stages: _Stages, began: float, threads: int | None) -> Joined:
     """Adapt a scene that is cut, and write it. `began`: when its time began to count."""
     facts = _adapted(scene, stages)
     last = time.perf_counter()
     with announced("measuring the whole"), thread_pool.limited_for(scene.backend, threads):
-        validation, returned = judged(scene)
+        judgment = judged(scene)
     stages.seconds["validation"] = time.perf_counter() - last
     stages.seconds["total"] = time.perf_counter() - began
     with announced(f"writing {stages.job.target.name}"):
-        files = _write_parts(scene, returned)
-        report = make_report(scene, files, facts, stages.seconds, validation, returned)
+        files = _write_parts(scene, judgment.returned)
+        report = make_report(scene, files, facts, stages.seconds, judgment)
         saved = _save(scene, stages.job, files, Joined(stages.job.target, report, facts))
     close_opened()
     return saved
@@ -161,8 +172,8 @@ def _adapted(scene: TiledScene, do: _Stages) -> list[dict[str, Any]]:
     do("truth", [truth_file(folder, part) for part in range(parts(scene.used_views))])
     do("start", [folder / START])
     facts: list[dict[str, Any]] = []
-    sweep, number = sweep_of(scene, 0), 0
-    while sweep is not None:
+    number, target = 0, math.inf if scene.config.target_db is None else scene.config.target_db
+    while sweep := sweep_of(scene, number):
         runs = [run_file(folder, tile, number) for tile in tiles]
         if not sweep.repeats and not all(file.exists() for file in runs):
             do("layer", [layer_file(folder, tile, number) for tile in tiles], number)
@@ -170,16 +181,16 @@ def _adapted(scene: TiledScene, do: _Stages) -> list[dict[str, Any]]:
         facts += do("tile", runs, number)
         do("steering", [steered_file(folder, number)], number)
         number += 1
-        sweep, state = sweep_of(scene, number), Steered.before(folder, number)
-        _forget(scene, sweep, state, number)
-        if scene.config.target_db is not None and state.psnr >= scene.config.target_db:
+        _forget(scene, number)
+        if Steered.before(folder, number).quality.psnr >= target:
             break
     return facts
 
 
-def _forget(scene: TiledScene, sweep: Sweep | None, state: Steered, made: int) -> None:
-    """Make room on the disk: of what `made` sweeps left, only what the next one, `sweep`, goes on with is needed."""
+def _forget(scene: TiledScene, made: int) -> None:
+    """Make room on the disk: of what `made` sweeps left, only what the next one goes on with is needed."""
     tiles, folder = range(len(scene.cores)), scene.folder
+    sweep, state = sweep_of(scene, made), Steered.before(folder, made)
     kept = {state.file(folder, tile) for tile in tiles}
     for number in range(made):  # and nothing of later sweeps, which an interrupted run has begun
         unneeded = {*folder.glob(f"tile_{number}_*.splats")} - kept

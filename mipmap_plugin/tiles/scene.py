@@ -31,6 +31,7 @@ from mipmap_plugin.models.exposure import read_exposures
 from mipmap_plugin.models.inria_folder import read_options, trained_scale
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
+from mipmap_plugin.scenes import Scene
 from mipmap_plugin.tiles.cut import Tree
 from mipmap_plugin.tiles.folder import BASE, CUT
 from mipmap_plugin.tiles.reading import find_splats
@@ -38,7 +39,7 @@ from mipmap_plugin.tiles.slabs import Painter
 from mipmap_plugin.tiles.splats import Splats
 from mipmap_plugin.tiles.store import Store
 from mipmap_plugin.tiles.sweeps import Sweep, sweeps, views_of
-from mipmap_plugin.wrap import Wrapped, wrap_unchecked
+from mipmap_plugin.wrap import WrapOptions, Wrapped, wrap_unchecked
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,15 +67,15 @@ class TiledScene:
         self.doubts: list[str] = stored["doubts"]  # about the base's splats, in sentences
         self.extras: list[str] = stored["extras"]  # columns of the base that tiles do not hold
         self.digest: str = stored["digest"]
-        self.wrapped = self._wrapped(base, stored["sample"])
+        self.wrapped, self.photographed = self._wrapped(base, stored["sample"])
         self.wrapped.targets(viewer)  # raises for what no viewer draws
         self.target = self.wrapped.effects(viewer=viewer)  # the sample does not tell whether splats that another near plane shows are in view
         self.backend, self.backend_note = self._backend(base.backend)
         self.asked_steps, self.config = config.steps, config
         self._fit()
 
-    def _wrapped(self, base: Base, sample: Tensor) -> Wrapped:
-        """Some of the splats with the cameras of all."""
+    def _wrapped(self, base: Base, sample: Tensor) -> tuple[Wrapped, Scene | None]:
+        """Some of the splats with the cameras of all, and the scene that these were read from, if it is given."""
         path, folder, iteration = self.checkpoint.path, self.checkpoint.folder, self.checkpoint.iteration
         origin = Origin(path, self.digest, folder, iteration, self.comments, exposures=read_exposures(folder))
         options, _ = read_options(folder)
@@ -82,7 +83,9 @@ class TiledScene:
         if self.kind is SurfelModel:
             trained = flat_trained(trained)
         model = self.kind(self.base.parameters(sample), trained, origin)
-        return wrap_unchecked(model, base.cameras, background=COLORS[base.background], screen_filter=base.screen_filter, up=base.up)[0]
+        told: WrapOptions = {"background": COLORS[base.background], "screen_filter": base.screen_filter, "up": base.up}
+        wrapped, scene = wrap_unchecked(model, base.cameras, **told)
+        return wrapped, None if scene is None or base.cameras is None else replace(scene, points=None)  # which may be millions, and have served
 
     def _backend(self, name: str) -> tuple[Any, str]:
         splats = self.wrapped.model.gaussians(self.wrapped.any_camera())
@@ -148,6 +151,10 @@ class TiledScene:
     def for_target(self, parameters: dict[str, Tensor]) -> VanillaModel:
         """A model of some splats, as it is saved for the target; its parameters are leaves that require gradients."""
         return self.kind(parameters, self.wrapped.model.trained.drawn_with(self.target)).copy()
+
+    def base_painter(self, fraction: float) -> Painter:
+        """What draws the base in pictures of a fraction of their size."""
+        return self.painter(replace(self.base_effects, eps2d=self.base_effects.eps2d * fraction**2))
 
     def painter(self, effects: Effects) -> Painter:
         """What draws splats from the disk."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -33,12 +32,6 @@ class Splats:
     def __len__(self) -> int:
         return len(self.places)
 
-    @cached_property
-    def starts(self) -> list[int]:
-        """The first row of each part, and the number of all rows."""
-        counts = torch.tensor([0, *(len(part) for part in self.parts)])
-        return [int(start) for start in counts.cumsum(0)]
-
     @classmethod
     def of(cls, kind: type[VanillaModel], parts: Sequence[Store]) -> Splats:
         """The splats of these files, whose places are read once."""
@@ -49,10 +42,13 @@ class Splats:
         order = rows.argsort()
         sorted_rows, coefficients = rows[order], self.parts[0].coefficients if colored else 1
         shapes, sh = torch.empty(len(rows), SHAPE), (torch.empty if colored else torch.zeros)(len(rows), coefficients, 3)
-        for part, first, end in zip(self.parts, self.starts, self.starts[1:], strict=False):
+        first = 0
+        for part in self.parts:
+            end = first + len(part)
             for start in range(first, end, CHUNK):  # so that little of a file is in memory at a time
                 low, high = torch.searchsorted(sorted_rows, torch.tensor([start, min(start + CHUNK, end)])).tolist()
                 part.read(sorted_rows[low:high] - first, shapes[low:high], sh[low:high] if colored else None)
+            first = end
         if not torch.equal(rows, sorted_rows):
             shapes, sh = (torch.empty_like(part).index_copy_(0, order, part) for part in (shapes, sh))
         return as_parameters(shapes, sh)

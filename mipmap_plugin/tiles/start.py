@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.optimization.validation import mean_db
+from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS, pixel_size, views_for
 from mipmap_plugin.adaptation.report import AS_IT_IS
+from mipmap_plugin.adaptation.start.base_weights import note_on_hidden
 from mipmap_plugin.adaptation.start.blend_weights import may_show, whole_weights
-from mipmap_plugin.adaptation.start.candidates import mildest_costs, start_name
+from mipmap_plugin.adaptation.start.candidates import start_name
 from mipmap_plugin.adaptation.start.closed_form import FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import matched_opacities
-from mipmap_plugin.adaptation.start.merging import merge_seen
+from mipmap_plugin.adaptation.start.merging import merge_down, merge_seen
+from mipmap_plugin.adaptation.start.strength import Bounds, Candidate, Costs, Merger
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.gaussians import Gaussians
@@ -26,10 +29,8 @@ from mipmap_plugin.tiles.splats import Splats
 from mipmap_plugin.tiles.store import Store, write_store
 from mipmap_plugin.tiles.truth import Truths
 
-# The roots of `merge_to` that are tried, as without tiles (`strength.POWERS`): the last, the mildest, and then the others.
-ROOTS = (1, 2, 4)
-
-CANDIDATES = ("formed", "mildest", "merged")  # names of their files
+# What the files of candidates begin with: of the base's splats, and of merged ones.
+FORMED, MERGED = "formed", "merged"
 
 
 class StartSearch:
@@ -41,24 +42,27 @@ class StartSearch:
         self.alike = draws_alike(*effects)
         self.forms = scene.config.closed_form and not filter_suffices(*effects)
         self.views: list[Camera] = []  # those in which blend weights are measured, which `_measured` finds
+        self.shown: list[Tensor] = []  # which splats of each core views show (`may_show`), as far as it is found
+        self.notes: list[str] = []
 
     @torch.no_grad()
     def run(self) -> None:
-        """Write the start of each tile, and `start.pt`: its name, and its PSNR on the steering views."""
-        config, base_db = self.scene.config, self.steer(self.scene.base)
+        """Write the start of each tile, and `start.pt`: its name, its quality on the steering views, and notes on it."""
+        config, base = self.scene.config, quality(self.scene, self.scene.base, self.truths)
         if not (self.forms or config.merge_to < 1):
-            return self._take_base(base_db)
+            return self._take_base(base)
         weights = self._measured()
         pool.release_to_system()
-        self._candidate("formed", weights, 1.0)
-        formed_db = self.steer(self._open("formed"))
-        if self.alike and formed_db < base_db:  # the filter itself is the better answer, for merged splats too, as without tiles
-            self.forms, formed_db = False, base_db
-        if config.merge_to < 1 and self._takes_merged(weights, formed_db, base_db):
-            return
-        if formed_db < base_db or not self.forms:
-            return self._take_base(base_db)
-        self._take("formed", start_name(self.forms), formed_db)
+        self._write(FORMED, weights, 1.0)
+        formed = quality(self.scene, self._open(FORMED), self.truths)
+        if self.alike and formed.visible < base.visible:  # the filter itself is the better answer, for merged splats too, as without tiles
+            self.forms, formed = False, base
+        bounds = Bounds(formed.psnr - config.merging_costs, base.visible, formed.psnr)
+        if config.merge_to < 1 and (merged := self._merger(weights).strongest(bounds)):
+            return self._take(merged.made, start_name(self.forms, merged=True), merged.quality)
+        if not self.forms or formed.visible < base.visible:
+            return self._take_base(base)
+        self._take(FORMED, start_name(self.forms), formed)
 
     def _measured(self) -> Tensor:
         """[N]: the blend weights of the base's splats, in target pixels of a view, from as many views as show enough of them, as without tiles."""
@@ -68,31 +72,36 @@ class StartSearch:
         self.views = evenly(scene.views.adapted, views_for(shown))
         if further := [view for view in self.views if view not in first]:
             weights = weights.lerp(painter.weighed(scene.base, further)[0], len(further) / (len(first) + len(further)))
-        return weights * scene.scale**2
+        weights, opacities, self.shown = weights * scene.scale**2, [], []
+        for core in scene.cores:
+            gaussians = scene.base.gaussians(core, colored=False)
+            _, whole = self._sizes(gaussians)
+            self.shown.append(may_show(weights[core], whole, gaussians.means, scene.views.adapted, self.views))
+            opacities.append(gaussians.opacities)
+        self.notes = note_on_hidden(torch.cat(self.shown), torch.cat(opacities))
+        return weights
 
-    def _takes_merged(self, weights: Tensor, formed_db: float, base_db: float) -> bool:
-        """Take the strongest merging that costs little, and return whether there is one; where the mildest costs too much, no other is tried."""
+    def _pixel_size(self, means: Tensor) -> Tensor:
+        """Of a base pixel at means [N, 3], in world units, [N]."""
+        return pixel_size(means, self.scene.views.adapted, len(self.views))
+
+    def _sizes(self, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
+        """[N]: of a base pixel at each splat, and of the splat's weight if nothing hid it."""
+        pixel = self._pixel_size(gaussians.means)
+        return pixel, whole_weights(gaussians, pixel, self.scene.views.adapted, self.scene.base_effects, self.scene.scale)
+
+    def _merger(self, weights: Tensor) -> Merger[str]:
+        """Merges the base's splats, which have these blend weights [N], into candidates, which it names."""
         scene, config = self.scene, self.scene.config
 
-        def tried(name: str, root: int, costs: float) -> tuple[float, bool]:
-            self._candidate(name, weights, config.merge_to ** (1 / root))
-            psnr = self.steer(self._open(name))
-            return psnr, psnr >= max(formed_db - costs, base_db)
+        def merge(power: float, coarsely: bool) -> Candidate[str]:
+            name = f"{MERGED}_{power:g}{'_coarsely' if coarsely else ''}"
+            self._write(name, weights, config.merge_to**power, coarsely)
+            splats = self._open(name)
+            return Candidate(name, quality(scene, splats, self.truths), len(splats))
 
-        title = start_name(self.forms, merged=True)
-        mildest_db, suits = tried("mildest", ROOTS[-1], mildest_costs(config, scene.base_effects, scene.target))
-        for root in ROOTS[:-1] if suits or mildest_db >= formed_db else ():
-            merged_db, is_taken = tried("merged", root, config.merging_costs)
-            if is_taken:
-                self._take("merged", title, merged_db)
-                return True
-        if suits:
-            self._take("mildest", title, mildest_db)
-        return suits
-
-    def steer(self, splats: Splats) -> float:
-        """PSNR (dB) on the steering views."""
-        return psnr(self.scene, splats, self.truths, self.scene.views.steering)
+        count, costs = sum(map(len, scene.cores)), Costs.of(config, scene.base_effects, scene.target)
+        return Merger(merge, lambda power: math.ceil(config.merge_to**power * count), costs)
 
     def _file(self, name: str, number: int) -> Path:
         return self.scene.folder / f"{name}_{number}.splats"
@@ -100,36 +109,34 @@ class StartSearch:
     def _open(self, name: str) -> Splats:
         return Splats.of(self.scene.kind, [Store(self._file(name, number)) for number in range(len(self.scene.cores))])
 
-    def _candidate(self, name: str, weights: Tensor, fraction: float) -> None:
-        """Write the closed form of the base after merging each core down to a fraction."""
-        cores = range(len(self.scene.cores))
-        merged = [self._merged(self._file(name, number), self.scene.cores[number], weights, fraction) for number in cores]
+    def _write(self, name: str, weights: Tensor, fraction: float, coarsely: bool = False) -> None:
+        """Write the closed form of the base after merging each core down to a fraction; `coarsely`: even where too few splats share a pixel."""
+        merged = [self._merged(name, number, weights[core], fraction, coarsely) for number, core in enumerate(self.scene.cores)]
         pool.release_to_system()
         if self.forms:
             self._match(name, *map(torch.cat, zip(*merged, strict=True)))
             pool.release_to_system()
 
-    def _merged(self, file: Path, core: Tensor, weights: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
-        """Write a core's candidate; returns its blend weights, and those that it had if nothing hid it."""
+    def _merged(self, name: str, number: int, own: Tensor, fraction: float, coarsely: bool) -> tuple[Tensor, Tensor]:
+        """Write a core's candidate, from its blend weights `own`; returns the candidate's, and those that it had if nothing hid it."""
         scene = self.scene
-        model = scene.for_target(scene.base.parameters(core))
-        own, whole = weights[core], torch.empty(0)
+        model = scene.for_target(scene.base.parameters(scene.cores[number]))
+        whole = torch.empty(0)
 
-        def sizes(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
-            """Of a base pixel at each splat, and of the splat's weight if nothing hid it."""
-            pixel = pixel_size(gaussians.means, scene.views.adapted, len(self.views))
-            return pixel, whole_weights(gaussians, pixel, scene.views.adapted, scene.base_effects, scene.scale)
+        def pixel_of(means: Tensor) -> Tensor:
+            return self._pixel_size(means) / scene.scale
 
         def merged(gaussians: Gaussians) -> Gaussians:
             nonlocal own
-            pixel, before = sizes(gaussians)
-            seen = may_show(own, before, gaussians.means, scene.views.adapted, self.views)
-            splats, own = merge_seen(gaussians, pixel / scene.scale, own, fraction, seen)
+            if coarsely:
+                splats, own = merge_down(gaussians, pixel_of, own, math.ceil(fraction * len(gaussians)))
+            else:
+                splats, own = merge_seen(gaussians, pixel_of(gaussians.means), own, fraction, self.shown[number])
             return splats
 
         def formed(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
             nonlocal whole
-            pixel, whole = sizes(gaussians)
+            pixel, whole = self._sizes(gaussians)
             form = FormSettings(area_power=1.0, views=len(self.views), pixel=pixel, matched=True)
             return closed_form(gaussians, scene.views.adapted, scene.scale, scene.base_effects, scene.target, form)
 
@@ -137,7 +144,7 @@ class StartSearch:
             model.rebuild(merged)
         if self.forms:
             model.reshape(formed)
-        write_store(file, model.parameters())
+        write_store(self._file(name, number), model.parameters())
         return own, whole
 
     def _match(self, name: str, wanted: Tensor, whole: Tensor) -> None:
@@ -160,23 +167,28 @@ class StartSearch:
             model.reshape(lambda gaussians: (gaussians.scales, matched))  # noqa: B023  # it is called at once
             write_store(self._file(name, number), model.parameters())
 
-    def _take_base(self, psnr: float) -> None:
+    def _take_base(self, found: Quality) -> None:
         for number, core in enumerate(self.scene.cores):
-            write_store(self._file("formed", number), self.scene.base.parameters(core))
-        self._take("formed", AS_IT_IS, psnr)
+            write_store(self._file(FORMED, number), self.scene.base.parameters(core))
+        self._take(FORMED, AS_IT_IS, found)
 
-    def _take(self, name: str, title: str, psnr: float) -> None:
+    def _take(self, name: str, title: str, found: Quality) -> None:
         """Keep the splats of a candidate as the start, and delete the other candidates."""
         for number in range(len(self.scene.cores)):
             self._file(name, number).replace(start_file(self.scene.folder, number))
-            for other in CANDIDATES:
-                self._file(other, number).unlink(missing_ok=True)
-        save_torch(self.scene.folder / START, {"name": title, "psnr": psnr}, overwrite=True)
+        for other in (*self.scene.folder.glob(f"{FORMED}_*.splats"), *self.scene.folder.glob(f"{MERGED}_*.splats")):
+            other.unlink()
+        save_torch(self.scene.folder / START, {"name": title, "quality": list(found), "notes": self.notes}, overwrite=True)
+
+
+def quality(scene: TiledScene, splats: Splats, truths: Truths) -> Quality:
+    """The quality on the steering views, as without tiles."""
+    return Quality.of([errors_of(scene, splats, truths, scene.views.steering)])
 
 
 @torch.no_grad()
-def psnr(scene: TiledScene, splats: Splats, truths: Truths, views: Any) -> float:
-    """The mean PSNR (dB) of splats as the target shows them over views, of images and truths clamped as a display does (`validation.mean_db`)."""
+def errors_of(scene: TiledScene, splats: Splats, truths: Truths, views: Sequence[Camera]) -> list[float]:
+    """The mean square error of each view of splats as the target shows them, of images and truths clamped as a display does, as without tiles."""
     painter = scene.painter(scene.target)
     images = ((painter.image(splats, view.zoomed(scene.scale)), truths[view.name]) for view in views)
-    return mean_db([float((image.clamp(0, 1) - truth.clamp(0, 1)).square().mean()) for image, truth in images])
+    return [float((image.clamp(0, 1) - truth.clamp(0, 1)).square().mean()) for image, truth in images]

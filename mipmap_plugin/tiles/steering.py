@@ -14,20 +14,23 @@ from itertools import count
 from pathlib import Path
 
 from mipmap_plugin.adaptation.optimization.steering import RATE_REDUCTION, warmed_up
-from mipmap_plugin.adaptation.optimization.validation import HARM_DB, TIE_DB
+from mipmap_plugin.adaptation.optimization.validation import HARM_DB, TIE_DB, Quality
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.tiles.folder import START, start_file, steered_file, tile_file
 from mipmap_plugin.tiles.scene import TiledScene
 from mipmap_plugin.tiles.splats import Splats
-from mipmap_plugin.tiles.start import psnr
+from mipmap_plugin.tiles.start import quality
 from mipmap_plugin.tiles.store import Store
 from mipmap_plugin.tiles.sweeps import Sweep
 from mipmap_plugin.tiles.truth import Truths
 
 # Steps that did harm are repeated this often, at half of the rates each time, before the run goes on without them.
 MOST_REPEATS = 3
+
+# Of a state that is not measured.
+UNKNOWN = Quality(-math.inf, -math.inf)
 
 
 @dataclass(frozen=True)
@@ -37,18 +40,18 @@ class Steered:
     sweep: int  # of the state that is gone on with, and the step after which the tiles were in it; -1: the start
     step: int
     ceiling: float = 1.0  # of the rates
-    psnrs: tuple[float, ...] = ()  # dB of the whole on the steering views at each check, up to the first that did harm
-    psnr: float = -math.inf  # dB of the state that is gone on with
+    checked: tuple[float, ...] = ()  # visible dB of the whole on the steering views at each check, up to the first that did harm
+    quality: Quality = UNKNOWN  # of the state that is gone on with
     following: Sweep | None = None  # None: the run is over
 
     @classmethod
     def before(cls, folder: Path, sweep: int) -> Steered:
         """What a sweep goes on with; after the last sweep: the result."""
         if not sweep:
-            return cls(-1, 0)
+            return cls(-1, 0, quality=Quality(*load_torch(folder / START)["quality"]))
         facts = read_json(steered_file(folder, sweep - 1))
-        following = facts.pop("following")
-        return cls(**facts, following=None if following is None else Sweep(**{**following, "checks": tuple(following["checks"])}))
+        following, quality = facts.pop("following"), Quality(*facts.pop("quality"))
+        return cls(**facts, quality=quality, following=None if following is None else Sweep(**{**following, "checks": tuple(following["checks"])}))
 
     def file(self, folder: Path, number: int) -> Path:
         """The splats of a tile in this state."""
@@ -72,23 +75,24 @@ def result(folder: Path) -> Steered:
 
 def steer(scene: TiledScene, sweep: Sweep) -> None:
     """Measure the whole at each check of a sweep, and write what the next sweep begins with."""
-    before = Steered.before(scene.folder, sweep.number)
-    truths, psnrs, harmful, start_db = Truths(scene), [], False, load_torch(scene.folder / START)["psnr"]
-    best, best_db, ceiling = before, before.psnr if sweep.number else start_db, before.ceiling
+    start, before = (Steered.before(scene.folder, number) for number in (0, sweep.number))
+    truths, checked, harmful = Truths(scene), [], False
+    best, reached, ceiling = before, before.quality, before.ceiling
     warms_up = sweep.end <= scene.config.warm_up_steps  # rates that lose a little in a few steps may gain in many
     for step in sweep.checks:
         state = Steered(sweep.number, step)
-        psnrs.append(psnr(scene, open_state(scene, state), truths, scene.views.steering))
-        if psnrs[-1] < (start_db if warms_up else best_db) - HARM_DB and scene.config.returns == "best":
+        found = quality(scene, open_state(scene, state), truths)
+        checked.append(found.visible)
+        if found.visible < (start.quality if warms_up else reached).visible - HARM_DB and scene.config.returns == "best":
             ceiling, harmful = RATE_REDUCTION * rate_factor(scene, step, ceiling), True
             break
-        if psnrs[-1] >= best_db - TIE_DB:
-            best, best_db = state, max(best_db, psnrs[-1])
+        if found.visible >= reached.visible - TIE_DB:
+            best, reached = state, max(reached, found)
     else:
-        best, best_db = state, psnrs[-1]  # what has learned most
+        best, reached = state, found  # what has learned most
     again = harmful and not warms_up and sweep.repeats < MOST_REPEATS
     following = repeated(sweep, best) if again else next_planned(scene, sweep)
-    after = Steered(best.sweep, best.step, ceiling, tuple(psnrs), best_db, following)
+    after = Steered(best.sweep, best.step, ceiling, tuple(checked), reached, following)
     write_json(steered_file(scene.folder, sweep.number), asdict(after), overwrite=True)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 
 from torch import Tensor
 
@@ -56,8 +55,7 @@ def draw_base(scene: TiledScene, view: Camera) -> Tensor:
     """The base's picture of a view, from splats on the disk, with the pixels that its truth is made from."""
     fraction = _fraction(scene)
     size = (max(1, round(pixels * fraction)) for pixels in (view.width, view.height))
-    effects = replace(scene.base_effects, eps2d=scene.base_effects.eps2d * fraction**2)
-    return scene.painter(effects).image(scene.base, view.resized(*size)).clamp(0, 1)
+    return scene.base_painter(fraction).image(scene.base, view.resized(*size)).clamp(0, 1)
 
 
 def resized(scene: TiledScene, view: Camera, image: Tensor) -> Tensor:

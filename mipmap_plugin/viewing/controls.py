@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from mipmap_plugin.errors import plural, some_of
 from mipmap_plugin.pages.record import zoom_name
 from mipmap_plugin.viewing.adapting import Progress
 from mipmap_plugin.viewing.stage import Look, Picture
@@ -131,7 +132,7 @@ def plain(text: str) -> str:
 
 def figures(picture: Picture) -> str:
     """A picture's figures, in Markdown."""
-    splats = [] if picture.splats is None else ["{:,} of {:,} splats".format(*picture.splats)]
+    splats = [] if picture.splats is None else [some_of(*picture.splats, "splat")]
     difference = [] if picture.psnr_db is None else [f"{picture.psnr_db:.2f} dB apart"]
     parts = [f"{picture.drawn.width} × {picture.drawn.height} px", f"{1000 * picture.seconds:,.0f} ms", *splats, *difference]
     return f"**×{picture.zoom:.3g}** · {plain(picture.shown)}\n\n{' · '.join(parts)}"
@@ -148,5 +149,5 @@ def words(progress: Progress) -> str:
         report = progress.adapted.report
         before, after = report.psnr_before(), report.psnr_after()
         gain = "" if before is None or after is None else f"{before:.2f} → {after:.2f} dB on views that nothing was adapted to, "
-        return f"{name}: {gain}{report.gaussians_before:,} → {report.gaussians_after:,} splats, {report.seconds['total']:.1f} s"
+        return f"{name}: {gain}{report.gaussians_before:,} → {plural(report.gaussians_after, 'splat')}, {report.seconds['total']:.1f} s"
     return f"{name}: step {progress.step}" if progress.curve else f"{name}: preparing ..."

@@ -68,6 +68,11 @@ def test_adapt_writes_beside_the_checkpoint_unless_told_otherwise(run, tmp_path)
     assert len(load_model(tmp_path / "base_x4.ply")) == 60
 
 
+def test_one_splat_is_told_as_one(run, tmp_path):
+    code, out, _ = run("adapt", tiny.ply(tmp_path / "base.ply"), "--scale", "1/2", *NO_STEP, "--splats", "1")
+    assert code == 0 and ", 60 -> 1 splat, " in out
+
+
 def test_files_and_pages_are_told_by_their_paths_from_here(run):
     """Files beside the checkpoint were told by their whole paths, and those of --output as they were given; the JSON has whole paths."""
     tiny.folder(Path("base"))

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 from unittest.mock import Mock
 
 import pytest
@@ -15,6 +16,7 @@ from commands_run import NO_STEP, QUICK, refused
 
 from mipmap_plugin.cli import COMMANDS, EXAMPLES
 from mipmap_plugin.commands.types import read_scale, read_viewer
+from mipmap_plugin.config import ResizeFilter
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
@@ -185,6 +187,12 @@ def test_a_mistake_points_to_the_help_of_its_command(run, words):
     said = run(*words.split())[2]
     assert f"mipmap-plugin {command} --help" in said
     assert [other for other in COMMANDS if other != command and f"mipmap-plugin {other}" in said] == []
+
+
+def test_names_to_choose_from_are_told_in_the_order_of_the_help(run):
+    """They were in another order in each process, and None, which nobody types, was among them."""
+    said = run("adapt", "a.ply", "--scale", "1/2", "--resize", "fine")[2]
+    assert re.findall(r"'([\w-]+)'", said.partition("one of")[2]) == [*get_args(ResizeFilter)]
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -130,6 +130,24 @@ def test_pictures_that_another_command_has_replaced_are_not_taken_for_finished(r
     assert {Image.open(file).size for file in (tmp_path / "out").iterdir()} == {(32, 24)}
 
 
+def test_depth_of_a_picture_that_is_replaced_goes_with_it(run, model_folder, tmp_path):
+    words = ["render", model_folder, "--output", tmp_path / "out", "--view", "view_1"]
+    assert run(*words, "--depth", "--normals")[0] == 0
+    assert run(*words, "--normals", "--scale", "1/2", "--overwrite")[0] == 0
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["train_view_1.png", "train_view_1_normals.npy"]
+
+
+def test_a_depth_that_was_deleted_after_an_interruption_is_written_again(run, model_folder, tmp_path, monkeypatch):
+    words = ["render", model_folder, "--output", tmp_path / "out", "--depth", "--overwrite"]
+    first = wrap_model(model_folder).render(tiny.cameras(1)[0], outputs=["depth"])
+    with monkeypatch.context() as interrupted:
+        interrupted.setattr(Wrapped, "render", Mock(side_effect=[first, KeyboardInterrupt]))
+        assert run(*words)[0] == 130
+    [depth] = (tmp_path / "out").glob("*_depth.npy")
+    depth.unlink()
+    assert run(*words)[0] == 0 and depth.exists()
+
+
 def test_picture_names_are_unique_and_stay_in_their_folder():
     given = [("a", "train"), ("a", "train"), ("a", "test"), ("../../b", "test"), ("c\\d", "train"), ("a_2", "train")]
     named = [replace(tiny.cameras(1)[0], name=name, split=split) for name, split in given]

@@ -1,5 +1,6 @@
 """Photographs of another scene than the checkpoint: `evaluate` says so."""
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -45,6 +46,12 @@ def test_evaluate_tells_of_photographs_of_another_scene(tmp_path, capsys, seed, 
     base, images = tiny.folder(tmp_path / "base"), tiny.scene(tmp_path / "scene", tiny.cameras(4, seed=9, split="test"), seed=seed)
     assert main(["evaluate", str(base), "--images", str(images), "--scale", "1/2", "--no-report"]) == 0
     assert (DOUBT in capsys.readouterr().err) == told
+
+
+def test_photographs_whose_cameras_are_given_too_are_told_of_once(tmp_path, capsys):
+    base, images = tiny.ply(tmp_path / "base.ply"), str(tiny.scene(tmp_path / "scene", tiny.cameras(4, seed=9, split="test"), seed=5))
+    assert main(["evaluate", str(base), "--images", images, "--cameras", images, "--scale", "1/2", "--no-report"]) == 0
+    assert "".join(capsys.readouterr().err.split()).count("theymaybeofanotherscene") == 1
 
 
 def test_an_adapted_file_is_not_doubted_for_what_it_shows_at_another_scale(tmp_path, capsys):
@@ -110,6 +117,18 @@ def test_what_a_base_leaves_empty_does_not_count():
     assert 10 < left.sum() < 40
     cut = wrap_model(VanillaModel.from_gaussians(tiny.gaussians()[left], whole.trained), cameras=cameras)
     assert not doubt(cut, seen(wrap_model(whole, cameras=cameras), cameras))
+
+
+def test_photographs_are_compared_as_they_were_exposed(tmp_path, recwarn):
+    """3DGS learns an exposure of each photograph (--train_test_exp), which a picture of the base is without."""
+    views = tiny.cameras(4)
+    folder, model = tiny.folder(tmp_path / "base", views), tiny.model()
+    dark = [[0.1, 0.0, 0.0, 0.5], [0.0, 0.1, 0.0, 0.5], [0.0, 0.0, 0.1, 0.5]]
+    (folder / "exposure.json").write_text(json.dumps({f"{view.name}.png": dark for view in views}))
+    draw = wrap_model(model, cameras=views).render
+    tiny.write_photographs(tmp_path / "scene", "train", views, lambda view: 0.5 + 0.1 * draw(view).image)
+    wrap_model(folder, cameras=tmp_path / "scene")
+    assert not recwarn
 
 
 def test_cameras_of_a_capture_that_does_not_show_the_splats_are_warned_of(tmp_path, recwarn):

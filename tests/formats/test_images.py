@@ -46,6 +46,14 @@ def test_jpeg_is_read(tmp_path):
     torch.testing.assert_close(read_image(tmp_path / "a.jpg", WHITE)[4, 4] * 255, torch.tensor([200.0, 100.0, 50.0]), atol=2, rtol=0)
 
 
+@pytest.mark.parametrize(("least", "size"), [(None, (40, 56)), (41, (40, 56)), (10, (10, 14)), (11, (20, 28))])
+def test_a_large_jpeg_is_read_smaller_where_few_pixels_do(tmp_path, least, size):
+    Image.new("RGB", (56, 40), (200, 100, 50)).save(tmp_path / "a.jpg", quality=95)
+    image = read_image(tmp_path / "a.jpg", WHITE, least)
+    assert tuple(image.shape[:2]) == size
+    torch.testing.assert_close(image[4, 4] * 255, torch.tensor([200.0, 100.0, 50.0]), atol=2, rtol=0)
+
+
 def test_16_bit_gray_keeps_its_precision(tmp_path):
     values = np.array([[0, 1, 257], [30000, 65534, 65535]], dtype=np.uint16)
     image = read_image(write_png(tmp_path / "a.png", (3, 2), GRAY_16, values.astype(">u2").tobytes()), WHITE)

@@ -180,6 +180,13 @@ def test_a_checkpoint_given_twice_is_one(tmp_path, monkeypatch):
     assert find_checkpoints([Path("b[1].ply")]) == [Path("b[1].ply")]  # a name, though it looks like a pattern
 
 
+def test_a_link_is_another_checkpoint_than_what_it_leads_to(tmp_path):
+    """Each is asked for by its name, and has an output of that name."""
+    (tmp_path / "link.ply").symlink_to(tiny.ply(tmp_path / "a.ply"))
+    given = [tmp_path / "link.ply", tmp_path / "a.ply"]
+    assert find_checkpoints([*given, tmp_path / "." / "link.ply"]) == given
+
+
 def test_a_list_of_cameras_beside_checkpoints_is_left_out_and_told_of(run, tmp_path):
     tiny.ply(tmp_path / "a.ply")
     write_cameras(tmp_path / "cameras.json", tiny.cameras(3))

@@ -71,6 +71,15 @@ def test_another_base_or_another_file_is_not_finished(tmp_path):
     assert finished(job) is None
 
 
+def test_what_is_finished_is_found_without_a_look_at_photographs(tmp_path, monkeypatch):
+    scene = tiny.scene(tmp_path / "scene", train=tiny.cameras(3))
+    job = job_of(tmp_path, base=Base(tiny.ply(tmp_path / "base.ply"), scene))
+    assert run_job(job).status == "done"
+    tiny.ply(tmp_path / "other.ply", seed=1).replace(tmp_path / "base.ply")
+    monkeypatch.setattr("mipmap_plugin.wrap.doubt_about", None)
+    assert finished(job) is None
+
+
 def test_other_cameras_background_or_photographs_are_not_finished(tmp_path):
     scene = tiny.scene(tmp_path / "scene", train=tiny.cameras(3), count=30)
     job = job_of(tmp_path, images=scene, scale=2.0, settings={"steps": 1, "seed": 0, "views": "train"})

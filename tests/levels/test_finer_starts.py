@@ -10,6 +10,7 @@ from brief_levels import BRIEF, wrapped
 
 from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.start import candidates
+from mipmap_plugin.adaptation.start.clock import start_clock
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
@@ -60,7 +61,7 @@ def test_what_is_merged_too_coarsely_leaves_the_choice_to_plain_merging(monkeypa
         return Quality(*[{"finer": 38.0, "base": base_db, "formed": 34.0}.get(model[0], coarse_db if model[-1] else 33.0)] * 2)
 
     def candidate(_, weights, fraction, coarsely=False):
-        return ("formed",) if fraction == 1 else ("merged", fraction, coarsely)
+        return Base(("formed",) if fraction == 1 else ("merged", fraction, coarsely))
 
     class Base(tuple):
         traits = Traits()
@@ -77,7 +78,7 @@ def test_what_is_merged_too_coarsely_leaves_the_choice_to_plain_merging(monkeypa
     )  # fmt: skip
     monkeypatch.setattr(candidates.BaseWeights, "measured", lambda *_: None)
     monkeypatch.setattr(candidates.StartSearch, "_candidate", candidate)
-    assert candidates.StartSearch(problem).best()[0] == start
+    assert candidates.StartSearch(problem, start_clock(problem)).best()[0] == start
 
 
 def test_a_start_has_to_be_finer():

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import tiny
 import torch
 
 from mipmap_plugin.adaptation.optimization.costs import Costs
+from mipmap_plugin.adaptation.optimization.validation import Quality
+from mipmap_plugin.adaptation.start import candidates
 from mipmap_plugin.adaptation.start import clock as clock_module
+from mipmap_plugin.adaptation.start.candidates import best_start
 from mipmap_plugin.adaptation.start.clock import Clock
 from mipmap_plugin.process.clock import now
 
@@ -59,6 +63,29 @@ def test_large_views_are_weighed_at_a_size_that_a_start_has_time_for(monkeypatch
 @pytest.mark.parametrize(("seconds", "pixels"), [(math.inf, 8000), (0.1, 1000)])
 def test_views_are_weighed_as_they_are_without_a_budget_and_where_they_are_small(seconds, pixels):
     assert Clock(seconds, torch.device("cpu")).size(tiny.cameras(1)[0].resized(pixels, pixels), 12, pytest.fail) == 1.0
+
+
+def test_a_further_start_has_the_time_that_the_first_has_left(monkeypatch):
+    """Both together take at most half of a budget."""
+    seconds, allowed = [0.0], []
+
+    class Search:
+        notes = ()
+
+        def __init__(self, _, clock):
+            self.clock = clock
+
+        def best(self):
+            with self.clock.timing("candidate"):
+                seconds[0] += 4.0
+            allowed.append(self.clock.allows("candidate"))
+            return None, "the start"
+
+    monkeypatch.setattr(clock_module, "now", lambda device: seconds[0])
+    monkeypatch.setattr(candidates, "StartSearch", Search)
+    quality, config = Quality(0.0, 0.0), SimpleNamespace(time_budget_s=20.0)
+    best_start([SimpleNamespace(base=tiny.model, config=config, coarse_base=None, quality=lambda _: quality)] * 2)
+    assert allowed == [True, False]
 
 
 def test_a_start_expects_a_candidate_of_fewer_splats_to_take_less_time(monkeypatch):

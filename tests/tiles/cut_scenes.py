@@ -9,7 +9,7 @@ from mipmap_plugin.recipes import recipe
 from mipmap_plugin.tiles import truth
 from mipmap_plugin.tiles.folder import work_folder
 from mipmap_plugin.tiles.reading import make_cut
-from mipmap_plugin.tiles.report import make_report
+from mipmap_plugin.tiles.report import Judgment, make_report
 from mipmap_plugin.tiles.scene import opened
 from mipmap_plugin.tiles.truth import draw_truths, parts
 
@@ -34,7 +34,7 @@ def rewritten(job, change):
 
 def report(scene, file):
     """The report of a scene whose tiles are adapted."""
-    return make_report(scene, [file], [], {"total": 1.0}, {}, "the start")
+    return make_report(scene, [file], [], {"total": 1.0}, Judgment({}, "the start", []))
 
 
 def config(**settings):

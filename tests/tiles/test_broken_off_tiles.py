@@ -13,6 +13,7 @@ import torch
 from cut_scenes import base_pictures
 
 from mipmap_plugin.adaptation.optimization.loop import adapt as real_adapt
+from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.errors import JobsFailed, OutputError, OutputExists, SceneError, SettingsError
 from mipmap_plugin.formats import staging
@@ -23,6 +24,7 @@ from mipmap_plugin.models.reading import load_vanilla
 from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.tiles import plan, run, steering, tile
 from mipmap_plugin.tiles.folder import truth_file, work_folder
+from mipmap_plugin.tiles.report import Judgment
 from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
 from mipmap_plugin.tiles.store import Store
 from mipmap_plugin.tiles.sweeps import Sweep
@@ -112,7 +114,7 @@ def test_saving_the_base_leaves_the_starts_to_the_next_run(job, monkeypatch):
     """A run that is killed while the base is saved comes to the same result when it goes on."""
     folder = work_folder(job.target)
     with monkeypatch.context() as patched, pytest.raises(OSError, match="no space left"):
-        patched.setattr(run, "judged", lambda scene: ({}, AS_IT_IS))
+        patched.setattr(run, "judged", lambda scene: Judgment({}, AS_IT_IS, []))
         patched.setattr(run, "_save", Mock(side_effect=OSError("no space left")))
         adapt_in_tiles(job, 2)
     starts = Store(folder / "start_0.splats").parameters()["opacities"]
@@ -161,9 +163,9 @@ def test_a_run_that_is_interrupted_anywhere_goes_on_to_the_same_bytes(job, monke
     gains, real_steer = {0: [1.0] * 6, 1: [1.5, -9.0], 2: [2.0], 3: [3.0] * 2}, steering.steer
 
     def steer(scene, made):
-        start_db, own = torch.load(scene.folder / "start.pt")["psnr"], iter(gains[made.number])
+        start_db, own = torch.load(scene.folder / "start.pt")["quality"][0], iter(gains[made.number])
         with monkeypatch.context() as patched:
-            patched.setattr(steering, "psnr", lambda *_: start_db + next(own))
+            patched.setattr(steering, "quality", lambda *_: Quality(*[start_db + next(own)] * 2))
             real_steer(scene, made)
 
     monkeypatch.setattr("mipmap_plugin.tiles.job.steer", steer)

@@ -32,7 +32,7 @@ def whole_and_tiles(halved):
     splats = open_state(halved, Steered.before(halved.folder, 0))
     view = halved.sweep_views(halved.sweeps[0])[0]
     around = [Surroundings(halved, number, halved.sweeps[0]) for number in range(3)]
-    rows = [torch.arange(first, end) for first, end in zip(splats.starts, splats.starts[1:], strict=False)]
+    rows = torch.arange(len(splats)).split([*map(len, splats.parts)])
     return splats.gaussians(torch.arange(len(splats))), view, rows, around
 
 

@@ -10,24 +10,33 @@ import tiny
 import torch
 from cut_scenes import config, cut_in_three
 
+from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS
 from mipmap_plugin.adaptation.schedule import ViewSchedule
+from mipmap_plugin.adaptation.start.strength import Merger
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.screen_filters import DILATION
 from mipmap_plugin.tiles import steering
+from mipmap_plugin.tiles.folder import start_file
 from mipmap_plugin.tiles.run import adapt_in_tiles
-from mipmap_plugin.tiles.start import StartSearch, psnr
+from mipmap_plugin.tiles.start import StartSearch, errors_of
 from mipmap_plugin.tiles.steering import Steered, sweep_of
+from mipmap_plugin.tiles.store import Store
 from mipmap_plugin.tiles.sweeps import Sweep, sweeps, views_of
+
+
+def equal(psnr):
+    """The quality of a state whose differences are all visible."""
+    return Quality(psnr, psnr)
 
 
 def chosen(scene, monkeypatch, psnrs):
     """The name of the start that is chosen where these PSNRs are measured, one after the other, and no more."""
     measured = iter(psnrs)
-    monkeypatch.setattr("mipmap_plugin.tiles.start.psnr", lambda *_: next(measured))
+    monkeypatch.setattr("mipmap_plugin.tiles.start.quality", lambda *_: equal(next(measured)))
     StartSearch(scene).run()
     assert not list(measured)
     return torch.load(scene.folder / "start.pt")["name"]
@@ -85,13 +94,42 @@ def test_what_is_in_the_picture_but_not_seen_is_weighed_in_more_views(job):
     assert len(search.views) == 2 * LEAST_VIEWS
 
 
+def test_splats_that_no_view_shows_are_told_of(job):
+    """As without tiles: half of them lie far behind all cameras."""
+    shown = tiny.gaussians(80)
+    folder = job.base.checkpoint.with_name("hidden")
+    VanillaModel.from_gaussians(shown.joined(replace(shown, means=shown.means + 1000.0)), TrainedScale()).save(folder, provenance={})
+    write_cameras(folder / "cameras.json", tiny.cameras(3, width=20, height=16))
+    with pytest.warns(UserWarning, match="no view shows 5[0-9]% of the splats"):
+        report = adapt_in_tiles(replace(job, base=Base(folder)), 2).report
+    assert any("no view shows" in note for note in report.notes)
+
+
 def test_without_a_closed_form_merged_splats_keep_their_opacities(job, monkeypatch):
     """As without tiles, where they are matched in the closed form."""
     scene = cut_in_three(job, merge_to=0.5, closed_form=False)
     monkeypatch.setattr(StartSearch, "_match", None)
-    monkeypatch.setattr("mipmap_plugin.tiles.start.psnr", lambda scene, splats, *_: -float(len(splats)))
+    monkeypatch.setattr("mipmap_plugin.tiles.start.quality", lambda scene, splats, *_: equal(-float(len(splats))))
     StartSearch(scene).run()
     assert torch.load(scene.folder / "start.pt")["name"] == "merged splats"
+
+
+@pytest.mark.parametrize(("steps", "psnrs"), [(0, (20.0, 30.0, 31.0, 30.5, 30.6)), (4, (20.0, 30.0, 31.0, 30.5))])
+def test_without_steps_a_stronger_merging_is_hardly_worse_than_a_milder_one(job, monkeypatch, steps, psnrs):
+    """As without tiles: what it costs beside the mildest, the third that is measured, no step regains."""
+    scene = cut_in_three(job, merge_to=0.5, steps=steps)
+    monkeypatch.setattr(Merger, "_further", lambda merger, found, bounds: found)
+    assert chosen(scene, monkeypatch, psnrs) == "the closed form of merged splats"
+
+
+@pytest.mark.parametrize(("steps", "splats"), [(0, 3 * 2), (4, 66)])
+def test_where_merging_gains_and_no_step_follows_cores_are_merged_beyond_the_limits(job, monkeypatch, steps, splats):
+    """As without tiles: within the limits 66 splats are left, where 2 of each core's 27 are wanted."""
+    scene = cut_in_three(job, merge_to=0.05, steps=steps)
+    monkeypatch.setattr("mipmap_plugin.tiles.start.quality", lambda scene, splats, *_: equal(-float(len(splats))))
+    StartSearch(scene).run()
+    assert sum(len(Store(start_file(scene.folder, number))) for number in range(3)) == splats
+    assert not [*scene.folder.glob("merged_*")]
 
 
 def test_a_truth_brighter_than_white_is_judged_as_it_is_displayed():
@@ -99,7 +137,7 @@ def test_a_truth_brighter_than_white_is_judged_as_it_is_displayed():
     filled = lambda level: torch.full((2, 2, 3), level)  # noqa: E731
     painter = SimpleNamespace(image=lambda splats, view: filled(1.0))
     scene, [view] = SimpleNamespace(painter=lambda target: painter, target=None, scale=0.5), tiny.cameras(1)
-    assert psnr(scene, None, {view.name: filled(1.1)}, [view]) == psnr(scene, None, {view.name: filled(1.0)}, [view])
+    assert errors_of(scene, None, {view.name: filled(1.1)}, [view]) == errors_of(scene, None, {view.name: filled(1.0)}, [view])
 
 
 def test_a_run_is_cut_into_a_warm_up_and_sweeps():
@@ -127,11 +165,20 @@ def measured(halved, monkeypatch):
 
     def give(*psnrs):
         each = iter(psnrs)
-        torch.save({"name": "the start", "psnr": 30.0}, halved.folder / "start.pt")
-        monkeypatch.setattr(steering, "psnr", lambda *_: next(each))
+        torch.save({"name": "the start", "quality": [30.0, 30.0]}, halved.folder / "start.pt")
+        monkeypatch.setattr(steering, "quality", lambda *_: equal(next(each)))
         monkeypatch.setattr(steering, "open_state", lambda *_: None)
 
     return give
+
+
+def test_a_loss_that_nobody_sees_is_no_harm(halved, measured, monkeypatch):
+    """As without tiles: a plain sky that falls from 54 dB to 45 takes no steps back that sharpen what is in front of it."""
+    measured()
+    monkeypatch.setattr(steering, "quality", lambda *_: Quality(visible=30.1, psnr=28.0))
+    steering.steer(halved, Sweep(0, 0, (1,), 0, 0))
+    after = Steered.before(halved.folder, 1)
+    assert (after.step, after.quality.psnr) == (1, 28.0)
 
 
 @pytest.mark.parametrize(
@@ -143,7 +190,7 @@ def test_what_does_harm_to_the_whole_is_undone(halved, measured, monkeypatch, ps
     monkeypatch.setattr(steering, "rate_factor", lambda *_: 1.0)
     steering.steer(halved, Sweep(0, 0, (1, 2), 0, 0))
     after = Steered.before(halved.folder, 1)
-    assert (max(after.step, 0), after.ceiling, tuple(after.psnrs)) == (kept, ceiling, psnrs)
+    assert (max(after.step, 0), after.ceiling, tuple(after.checked)) == (kept, ceiling, psnrs)
 
 
 def test_a_little_loss_in_the_warm_up_is_no_harm_and_it_is_not_repeated(halved, measured, monkeypatch):
@@ -179,10 +226,10 @@ def test_what_a_sweep_is_measured_by_is_what_it_began_with(halved, measured):
     measured(32.0, 31.0, 31.5, 31.45)
     halved.config = halved.config.model_copy(update={"warm_up": 0.5})
     steering.steer(halved, Sweep(0, 0, (1, 2), 0, 0))
-    assert Steered.before(halved.folder, 1).psnr == 31.0
+    assert Steered.before(halved.folder, 1).quality.psnr == 31.0
     steering.steer(halved, Sweep(1, 2, (3, 4), 1, 1))
     after = Steered.before(halved.folder, 2)
-    assert (after.sweep, after.step, after.ceiling, after.psnr) == (1, 4, 1.0, 31.45)
+    assert (after.sweep, after.step, after.ceiling, after.quality.psnr) == (1, 4, 1.0, 31.45)
 
 
 def test_a_run_ends_with_the_sweep_that_reaches_the_target(job):

@@ -178,9 +178,10 @@ def test_commands_that_cannot_be(words, reason, capsys):
     assert reason in capsys.readouterr().err
 
 
-def test_a_sample_of_the_splats_is_not_compared_with_the_photographs_of_cameras(tmp_path, monkeypatch, recwarn):
-    """It shows next to nothing of them."""
+@pytest.mark.parametrize("seed", [0, 5], ids=["its own scene", "another"])
+def test_photographs_of_cameras_are_compared_with_the_whole_base(tmp_path, monkeypatch, recwarn, seed):
+    """A sample of its splats shows next to nothing of them."""
     monkeypatch.setattr("mipmap_plugin.tiles.reading.SAMPLE", 3)
-    base = Base(tiny.ply(tmp_path / "base.ply"), tiny.scene(tmp_path / "scene", train=tiny.cameras(4)))
+    base = Base(tiny.ply(tmp_path / "base.ply"), tiny.scene(tmp_path / "scene", train=tiny.cameras(4), seed=seed))
     adapt_in_tiles(Job(base, tmp_path / "out.ply", 0.5, recipe="instant"), 2)
-    assert not any("another scene" in str(warning.message) for warning in recwarn)
+    assert any("they may be of another scene" in str(warning.message) for warning in recwarn) == (seed == 5)

@@ -20,6 +20,7 @@ from mipmap_plugin.cli import main
 from mipmap_plugin.formats import staging
 from mipmap_plugin.formats.ply import read_header, read_ply
 from mipmap_plugin.jobs.base import Base
+from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.levels.distance.mixture import together
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import TrainedScale
@@ -58,6 +59,14 @@ def test_a_scene_in_tiles_is_whole_and_better_than_its_base(job, monkeypatch):
     # The cores stand in the file one after the other.
     cores = b"".join(body[body.index(b"end_header\n") + 11 :] for body in bodies)
     assert joined.file.read_bytes()[read_header(joined.file).body :] == cores
+
+
+def test_views_that_look_worse_than_the_base_are_told_of_in_tiles_too(tmp_path):
+    views = [replace(view, fx=times * view.fx, fy=times * view.fy) for view, times in zip(tiny.cameras(8), (1, 8) * 4, strict=True)]
+    job = Job(Base(tiny.folder(tmp_path / "scene", views, count=20)), tmp_path / "out.ply", 1 / 4, recipe="instant")
+    with pytest.warns(UserWarning, match="the file for x0.25 looks worse than the base"):
+        report = adapt_in_tiles(job, 2).report
+    assert any("the file for x0.25 looks worse than the base" in note for note in report.notes)
 
 
 def test_a_large_scene_takes_fewer_steps_in_tiles_too(job, monkeypatch):

@@ -22,6 +22,7 @@ from mipmap_plugin.adaptation.optimization.validation import WINDOW
 from mipmap_plugin.adaptation.target.pseudo_truth import resolution
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.errors import plural
 from mipmap_plugin.models.base import SplatModel
 
 # A step takes so many times as long as its images, drawn one by one: they are drawn together, and then differentiated and moved.
@@ -140,7 +141,7 @@ def plan_note(run: Run, config: AdaptConfig) -> str:
     planned = run.step >= run.planned or run.ended_by is End.TIME
     if not run.step or not planned or run.planned in (0, config.steps):
         return ""
-    taken = "" if run.step >= run.planned else f"after {run.step} of {run.planned} steps, "
+    taken = "" if run.step >= run.planned else f"after {run.step} of {plural(run.planned, 'step')}, "
     return f" ({taken}planned for the time budget in place of {config.steps})"
 
 

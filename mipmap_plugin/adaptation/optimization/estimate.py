@@ -16,6 +16,7 @@ from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.schedule import ViewSchedule
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.errors import plural
 from mipmap_plugin.progress import Bar
 
 BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{left}, {rate_fmt}{postfix}]"
@@ -75,7 +76,7 @@ class StepsBar(Bar):
         self.update()
         if run.curve[-1].step == run.step:
             quality = f"{run.curve[-1].validation_db:.2f} dB, " if task.validation.steering else ""
-            self.set_postfix_str(f"{quality}{run.curve[-1].gaussians} splats")
+            self.set_postfix_str(f"{quality}{plural(run.curve[-1].gaussians, 'splat')}")
 
     @property
     def format_dict(self) -> dict[str, Any]:

@@ -7,7 +7,7 @@ The other half is used once, at the end, to choose among the base as it is, the 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import fmean
@@ -68,6 +68,14 @@ class Quality(NamedTuple):
     visible: float  # as far as differences are visible: states are compared by it
     psnr: float  # what is told
 
+    @classmethod
+    def of(cls, errors: Sequence[Sequence[float]]) -> Quality:
+        """That of a state with these mean square errors of each view, per viewer, of which the worst viewer counts most.
+
+        The worst viewer alone would be too strict, as it may fall a little while all others improve; the mean PSNR would hide it.
+        """
+        return cls(*(decibel(fmean(10 ** (-mean(each) / 10) for each in errors)) for mean in (_visible_db, mean_db)))
+
 
 @dataclass(frozen=True)
 class Validation:
@@ -113,12 +121,8 @@ class Validation:
         return self.quality(model).visible
 
     def quality(self, model: SplatModel) -> Quality:
-        """The quality on the steering views, of the mean square error over viewers, in which the worst viewer counts most.
-
-        The worst viewer alone would be too strict, as it may fall a little while all others improve; the mean PSNR would hide it.
-        """
-        errors = self._errors(model, self.steering)
-        return Quality(*(decibel(fmean(10 ** (-mean(each) / 10) for each in errors)) for mean in (_visible_db, mean_db)))
+        """The quality on the steering views."""
+        return Quality.of(self._errors(model, self.steering))
 
     def choose(self, states: dict[str, SplatModel], allowed: Collection[str] | None = None) -> tuple[str, dict[str, float], dict[str, list[float]]]:
         """The state of the best visible quality, of those that are `allowed`, each state's PSNR in its worst viewer, and its visible dB of each view.
@@ -127,10 +131,7 @@ class Validation:
         """
         errors = {name: self._errors(model, self.choosing) for name, model in states.items()}
         quality = {name: min(map(_visible_db, each)) for name, each in errors.items()}
-        among = [name for name in states if allowed is None or name in allowed]
-        best, first = max(quality[name] for name in among), next(iter(states))
-        least = max(best - TIE_DB, quality[first]) if first in among else best - TIE_DB
-        chosen = [name for name in among if quality[name] >= least][-1]
+        chosen = last_of_best({name: quality[name] for name in states if allowed is None or name in allowed}, next(iter(states)))
         by_view = {name: [_visible_db([fmean(one)]) for one in zip(*each, strict=True)] for name, each in errors.items()}
         return chosen, {name: min(map(mean_db, each)) for name, each in errors.items()}, by_view
 
@@ -148,6 +149,12 @@ def _drawing(
         return render.of(shared)
     drawn = dict(zip(cameras, render_views(shared, [(camera, render.effects) for camera in cameras]), strict=True))
     return lambda camera: drawn[camera].image
+
+
+def last_of_best(visible: Mapping[str, float], first: str) -> str:
+    """The last of the states that are as good as the best by these visible dB, but none that is worse than the `first`, which is what went in."""
+    least = max(max(visible.values()) - TIE_DB, visible.get(first, -math.inf))
+    return [name for name, db in visible.items() if db >= least][-1]
 
 
 def mean_db(errors: Sequence[float]) -> float:

@@ -53,10 +53,7 @@ class BaseWeights:
         weights = weights * problem.scale**2
         whole, looked_at = self.whole(gaussians, self.pixel_size(gaussians.means)), evenly(problem.views, self.count)
         self.shown = may_show(weights, whole, gaussians.means, problem.views, looked_at)
-        drawn = gaussians.opacities >= MIN_ALPHA
-        if (hidden := float((~self.shown)[drawn].float().mean())) > HIDDEN:
-            advice = "give cameras that show all of the scene, or look at it from where these do"
-            self.notes.append(f"no view shows {hidden:.0%} of the splats, of which the dB say nothing: {advice}")
+        self.notes += note_on_hidden(self.shown, gaussians.opacities)
         return weights
 
     def whole(self, gaussians: Gaussians, pixel: Tensor) -> Tensor:
@@ -71,3 +68,11 @@ class BaseWeights:
         pixels = pixel_size(means, self._problem.closest_of, self.count)
         self._of_base = self._of_base or (means, pixels)
         return pixels
+
+
+def note_on_hidden(shown: Tensor, opacities: Tensor) -> list[str]:
+    """That views show too little of the splats, of which they show those that are True in `shown` [N], in a sentence; none if they show enough."""
+    if not (hidden := float((~shown)[opacities >= MIN_ALPHA].float().mean())) > HIDDEN:
+        return []
+    advice = "give cameras that show all of the scene, or look at it from where these do"
+    return [f"no view shows {hidden:.0%} of the splats, of which the dB say nothing: {advice}"]

@@ -15,16 +15,15 @@ from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.pixel_size import mean_pixel_size
 from mipmap_plugin.adaptation.start.base_weights import BaseWeights
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
-from mipmap_plugin.adaptation.start.clock import start_clock
+from mipmap_plugin.adaptation.start.clock import Clock, start_clock
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import ROUNDS, matched_opacities
 from mipmap_plugin.adaptation.start.merging import Rounds, merge_down, merge_seen
 from mipmap_plugin.adaptation.start.problem import StartProblem
-from mipmap_plugin.adaptation.start.strength import POWERS, Bounds, Merger
+from mipmap_plugin.adaptation.start.strength import POWERS, Bounds, Candidate, Costs, Merger
 from mipmap_plugin.adaptation.start.thinning import evenly_in_space, least_fraction
 from mipmap_plugin.camera import evenly
-from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.effects import SURFEL, Effects
+from mipmap_plugin.effects import SURFEL
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SPLATS, SplatModel, Thinned, places
 from mipmap_plugin.models.contract import rebuild, reshape
@@ -32,10 +31,6 @@ from mipmap_plugin.screen_filters import INTEGRATED
 
 # Crispnesses also tried where a zoom-in below CRISPER_BELOW takes no steps: from there on the softest always looks best, shrunk, even of thin wires.
 CRISPER, CRISPER_BELOW = (0.5, 1.0), 2.0
-
-# dB that the mildest merging may cost before steps for a renderer that draws otherwise than the training did, even if the settings allow less: fewer
-# splats learn that sooner, and better. What stronger merging costs does not come back (docs/recipes_found.md).
-MILD_COSTS = 0.6
 
 # The least dB of splats that are merged even where too few share a pixel: from 29 dB steps regained all that merging had cost, from 20 dB a third.
 LEAST_DB = 25.0
@@ -75,30 +70,22 @@ def best_start(problems: Sequence[StartProblem]) -> tuple[SplatModel, str, list[
     for problem in problems:
         if not found or clock.allows("start"):
             with clock.timing("start"):
-                search = StartSearch(problem)
+                search = StartSearch(problem, clock.rest())
                 start, name = search.best()
             found.append((start, name if len(problems) == 1 or problem.coarse_base else f"{name} without the conversion", search.notes))
             del search  # which keeps memory
     return max(found, key=lambda each: problems[0].quality(each[0]).visible) if len(found) > 1 else found[0]
 
 
-def mildest_costs(config: AdaptConfig, base: Effects, target: Effects) -> float:
-    """dB that the mildest merging may cost."""
-    learns = config.steps > 0 and base != target and config.merging_costs
-    return max(config.merging_costs, MILD_COSTS) if learns else config.merging_costs
-
-
 class StartSearch:
     """The candidates, and the choice among them by their PSNR on the steering views."""
 
-    def __init__(self, problem: StartProblem) -> None:
-        self._problem, self._rounds = problem, Rounds()
+    def __init__(self, problem: StartProblem, clock: Clock) -> None:
+        self._problem, self._clock, self._rounds = problem, clock, Rounds()
         self._least, self._crispness = 0.0, problem.config.crispness  # the fraction of the rows that stay, of a zoom-in how crisp it is
-        self._clock = start_clock(problem)
-        self._seen = BaseWeights(problem, self._clock)
+        self._seen = BaseWeights(problem, clock)
         self.notes = self._seen.notes
         self._alike = draws_alike(problem.base_effects, problem.target)
-        self._more_costs = mildest_costs(problem.config, problem.base_effects, problem.target) - problem.config.merging_costs
         self._forms = problem.config.closed_form
         spreads = problem.target.screen_filter == SURFEL or problem.target.screen_filter in INTEGRATED  # otherwise than by a variance in px²
         suffices = filter_suffices(problem.base_effects, problem.target)
@@ -128,9 +115,8 @@ class StartSearch:
         bounds = Bounds(self._least_psnr(after), before.visible - problem.may_lose, after.psnr)
         self._least = least_fraction(base, problem.views, problem.scale) if base.traits.thins else 0.0
         fewer = config.merge_to < 1 and self._least < 1
-        merged = self._merger(weights).strongest(bounds, self._coarse_bounds(bounds, before)) if fewer else None
-        if merged is not None:
-            return merged, start_name(self._forms, merged=True, thinned=base.traits.thins)
+        if fewer and (strongest := self._merger(weights).strongest(bounds, self._coarse_bounds(bounds, before))):
+            return strongest.made, start_name(self._forms, merged=True, thinned=base.traits.thins)
         return (formed, start_name(True)) if self._forms and after.visible >= before.visible else (base, problem.name)
 
     def _as_crisp_as_shown(self, formed: SplatModel, weights: Tensor | None) -> tuple[SplatModel, Quality]:
@@ -173,18 +159,19 @@ class StartSearch:
             return least
         return max(least, (formed.psnr + problem.quality(problem.coarse_base()).psnr) / 2)
 
-    def _merger(self, weights: Tensor | None) -> Merger:
-        config, count = self._problem.config, len(self._problem.base().parameters()["means"])
+    def _merger(self, weights: Tensor | None) -> Merger[SplatModel]:
+        problem, count = self._problem, len(self._problem.base().parameters()["means"])
 
-        def merge(power: float, coarsely: bool) -> tuple[SplatModel, Quality] | None:
+        def merge(power: float, coarsely: bool) -> Candidate[SplatModel] | None:
             fraction = self._fraction(power)
             if not self._clock.allows("candidate", fraction):
                 return None
             with self._clock.timing("candidate", fraction):
                 candidate = self._candidate(weights, fraction, coarsely)
-                return candidate, self._problem.quality(candidate)
+                return Candidate(candidate, problem.quality(candidate), len(candidate.parameters()["means"]))
 
-        return Merger(merge, lambda power: math.ceil(self._fraction(power) * count), config.merging_costs, self._more_costs, config.steps > 0)
+        costs = Costs.of(problem.config, problem.base_effects, problem.target)
+        return Merger(merge, lambda power: math.ceil(self._fraction(power) * count), costs)
 
     def _fraction(self, power: float) -> float:
         """The fraction of the splats that a power of `merge_to` leaves."""

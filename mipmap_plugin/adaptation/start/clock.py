@@ -55,6 +55,10 @@ class Clock:
         possible = WEIGHING * (self._seconds - self._spent()) / (count * self._took["trial"])  # views of the least size, in place of each
         return min(1.0, least * math.sqrt(max(1.0, possible)))
 
+    def rest(self) -> Clock:
+        """Another one, of the time that is left."""
+        return Clock(self._seconds - self._spent(), self._device)
+
     def _spent(self) -> float:
         return now(self._device) - self._began
 

@@ -1,12 +1,14 @@
-"""How strongly splats are merged: which candidates are tried, and the choice among them."""
+"""How strongly splats are merged, as a whole and in tiles: which candidates are tried, and the choice among them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Generic, NamedTuple, TypeVar
 
 from mipmap_plugin.adaptation.optimization.validation import Quality
-from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.effects import Effects
 
 # The powers of `merge_to` that are tried: the last, the mildest, and then the others, until merging loses little enough.
 POWERS = (1, 1 / 2, 1 / 4)
@@ -19,7 +21,20 @@ COARSE_POWERS = (1, 7 / 8, 3 / 4, 5 / 8, 1 / 2)
 # a pixel. At x0.57 in PlayCanvas a lattice of dots gains 0.6 dB by the first.
 FURTHER_POWERS = (1 / 2, 3 / 4, 1)
 
-Candidate = tuple[SplatModel, Quality]
+# dB that the mildest merging may cost before steps for a renderer that draws otherwise than the training did, even if the settings allow less: fewer
+# splats learn that sooner, and better. What stronger merging costs does not come back (docs/recipes_found.md).
+MILD_COSTS = 0.6
+
+Made = TypeVar("Made")
+
+
+@dataclass(frozen=True)
+class Candidate(Generic[Made]):
+    """Merged splats."""
+
+    made: Made  # a model, or where it lies
+    quality: Quality
+    count: int  # of its splats
 
 
 class Bounds(NamedTuple):
@@ -38,51 +53,65 @@ class Bounds(NamedTuple):
         return self._replace(psnr=max(self.psnr, quality.psnr - costs))
 
 
-class Merger(NamedTuple):
-    """What merges splats as strongly as it is told, and what that may cost."""
+class Costs(NamedTuple):
+    """dB that merging may cost."""
 
-    merge: Callable[[float, bool], Candidate | None]  # to a power of `merge_to`, whether even where too few share a pixel; None: there is no time
-    least: Callable[[float], int]  # how many splats a power leaves where as many are merged as it says
-    costs: float  # dB that merging may cost
-    more_costs: float  # dB that the mildest merging may cost beyond that
+    usual: float
+    mildest: float  # what the mildest merging may
     learns: bool  # whether steps follow, which regain what merging costs
 
-    def strongest(self, bounds: Bounds, coarse_bounds: Bounds | None) -> SplatModel | None:
+    @classmethod
+    def of(cls, config: AdaptConfig, base: Effects, target: Effects) -> Costs:
+        """Those of a run. `base`, `target`: how the base and the adapted file are rendered."""
+        usual, learns = config.merging_costs, config.steps > 0
+        return cls(usual, max(usual, MILD_COSTS) if learns and base != target and usual else usual, learns)
+
+
+@dataclass(frozen=True)
+class Merger(Generic[Made]):
+    """What merges splats as strongly as it is told, and what that may cost."""
+
+    # to a power of `merge_to`, whether even where too few share a pixel; None: there is no time
+    merge: Callable[[float, bool], Candidate[Made] | None]
+    least: Callable[[float], int]  # how many splats a power leaves where as many are merged as it says
+    costs: Costs
+
+    def strongest(self, bounds: Bounds, coarse_bounds: Bounds | None = None) -> Candidate[Made] | None:
         """The candidate of the strongest merging within the bounds; None if merging costs too much.
 
         If the mildest merging already loses too much, as with captures, no stronger one is tried. If the mildest gains, a stronger one is tried
         even where the base as it is looks better, since it may be better than both.
         """
         if coarse_bounds and (coarse := self._first(COARSE_POWERS, True, coarse_bounds)):
-            return coarse[0]
+            return coarse
         if (mildest := self.merge(POWERS[-1], False)) is None:
             return None
-        suits, gains = bounds.hold_for(mildest[1], self.more_costs), mildest[1].psnr >= bounds.formed
+        suits, gains = bounds.hold_for(mildest.quality, self.costs.mildest - self.costs.usual), mildest.quality.psnr >= bounds.formed
         if not (suits or gains):
             return None
-        if not self.learns:
-            bounds = bounds.beside(mildest[1], self.costs)
+        if not self.costs.learns:
+            bounds = bounds.beside(mildest.quality, self.costs.usual)
         found = self._first(POWERS[:-1], False, bounds) or (mildest if suits else None)
-        if found and not self.learns and not coarse_bounds and found[1].psnr > bounds.formed:
+        if found and not self.costs.learns and not coarse_bounds and found.quality.psnr > bounds.formed:
             found = self._further(found, bounds)
-        return found and found[0]
+        return found
 
-    def _first(self, powers: tuple[float, ...], coarsely: bool, bounds: Bounds) -> Candidate | None:
+    def _first(self, powers: tuple[float, ...], coarsely: bool, bounds: Bounds) -> Candidate[Made] | None:
         """The first candidate within the bounds, of those that there is time for."""
         for power in powers:
             if (candidate := self.merge(power, coarsely)) is None:
                 return None
-            if bounds.hold_for(candidate[1]):
+            if bounds.hold_for(candidate.quality):
                 return candidate
         return None
 
-    def _further(self, found: Candidate, bounds: Bounds) -> Candidate:
+    def _further(self, found: Candidate[Made], bounds: Bounds) -> Candidate[Made]:
         """The strongest merging beyond that of a candidate, until it costs too much beside the best; the candidate itself, if it does at once."""
-        reached = len(found[0].parameters()["means"])
+        reached = found.count
         for power in (each for each in FURTHER_POWERS if self.least(each) < reached):
-            bounds = bounds.beside(found[1], self.costs)
+            bounds = bounds.beside(found.quality, self.costs.usual)
             further = self.merge(power, True)
-            if further is None or not bounds.hold_for(further[1]):
+            if further is None or not bounds.hold_for(further.quality):
                 break
             found = further
         return found

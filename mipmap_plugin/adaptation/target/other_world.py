@@ -13,6 +13,7 @@ from mipmap_plugin.adaptation.curve import psnr_as_shown
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.camera import Camera, evenly
+from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
 from mipmap_plugin.progress import announced
 
 # So many photographs are looked at, at so many px of the shorter side; they tell as much as all do at their own size.
@@ -33,6 +34,7 @@ def doubt_about(
     render: Callable[..., Rendered],
     background: tuple[float, float, float],
     option: str,
+    exposures: Exposures = NO_EXPOSURES,
 ) -> str:
     """That the base shows photographs worse than the mean of the others does, in a sentence; "" if it shows them better.
 
@@ -40,7 +42,7 @@ def doubt_about(
     base is empty, it may also count as showing that mean, for it may be one object of a capture.
 
     `cameras`: in the base's frame and at the density of its pixels, each with a `photograph` [H, W, 3] of any size; `render`: that of
-    the base (`FrozenBase.render`), on its `background` (RGB); `option`: that gave them.
+    the base (`FrozenBase.render`), on its `background` (RGB); `option`: that gave them; `exposures`: of the photographs, as far as they are known.
     """
     cameras = _from_different_places(evenly(cameras, MOST_VIEWS))
     if len(cameras) < 2:
@@ -57,9 +59,10 @@ def doubt_about(
     @torch.no_grad()
     def by_base(views: Sequence[Camera]) -> float:
         shown = [render(view.zoomed(factor), factor, "scaled") for view in views]
-        images = [resize(each.image.cpu(), size, "area") for each in shown]
+        images = [resize(exposures.applied(each.image.cpu(), view), size, "area") for each, view in zip(shown, views, strict=True)]
         empty = [resize(1 - each.alpha.cpu()[..., None].expand_as(each.image), size, "area") for each in shown]
-        filled = [image + hole * (other - image.new_tensor(background)) for image, hole, other in zip(images, empty, others, strict=True)]
+        behind = [exposures.applied(torch.tensor(background), view) for view in views]
+        filled = [image + hole * (other - color) for image, hole, other, color in zip(images, empty, others, behind, strict=True)]
         return max(fmean(map(psnr_as_shown, each, truths)) for each in (images, filled))
 
     if (found := by_base(cameras)) > by_others:

@@ -12,7 +12,7 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.target.other_world import doubt_about
+from mipmap_plugin.adaptation.target.other_world import LOOK, doubt_about
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Rendered
@@ -63,7 +63,7 @@ class Photographs:
     def warn_of_others(self, render: Callable[..., Rendered]) -> None:
         """Warn if the base, by its `render`, does not show what they do (`doubt_about`)."""
         scene, color, originals = self._scene, self._background, self._originals
-        if doubt := doubt_about(self.cameras, lambda view: scene.image(originals[view], color), render, color, "--images"):
+        if doubt := doubt_about(self.cameras, lambda view: scene.image(originals[view], color, LOOK), render, color, "--images"):
             warn(doubt)
 
     def __call__(self, view: Camera) -> Tensor | None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, plural
 from mipmap_plugin.formats.state_dict import run_layer
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.anchors.networks import EMBEDDING, Weights
@@ -70,6 +70,6 @@ def _appearance(table: Tensor, camera: Camera) -> Tensor:
     if camera.index is None:
         return table.mean(dim=0, keepdim=True)
     if not 0 <= camera.index < len(table):
-        has = f"camera {camera.name!r} has index {camera.index}, but the model has the appearance of {len(table)} views only"
+        has = f"camera {camera.name!r} has index {camera.index}, but the model has the appearance of {plural(len(table), 'view')} only"
         raise SettingsError(f"{has}; give the cameras of its training, or an index of None for the mean of all")
     return table[camera.index][None]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effect
-from mipmap_plugin.errors import CheckpointError, SettingsError
+from mipmap_plugin.errors import CheckpointError, SettingsError, plural
 from mipmap_plugin.models.anchors.companions import NEEDED
 from mipmap_plugin.models.anchors.decoding import Anchors
 from mipmap_plugin.models.anchors.files import AnchorFile, read_anchors
@@ -45,7 +45,7 @@ class OctreeModel(AnchorModel):
             raise CheckpointError(f"{self.source}: its anchors lie in {self._levels:,} levels of detail; the file is damaged, so export it again")
         if self._levels > 1:
             self._shrink_option = "resolution_scales"  # -r makes pictures smaller, and leaves the levels as they are (utils/camera_utils.py)
-        self.notes.append(f"{self._levels} levels of detail, chosen by distance and zoom ({to_level}, each {fork:g} times finer)")
+        self.notes.append(f"{plural(self._levels, 'level')} of detail, chosen by distance and zoom ({to_level}, each {fork:g} times finer)")
 
     def _effects(self) -> tuple[Effect, ...]:
         reason = f"{self._levels} of them, chosen by distance and zoom ({self._to_level})"

@@ -11,6 +11,7 @@ import torch
 from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation.optimization.validation import Quality, mean_db
 from mipmap_plugin.adaptation.start import candidates
+from mipmap_plugin.adaptation.start.clock import start_clock
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
@@ -63,7 +64,7 @@ def test_merged_splats_keep_their_shapes_where_the_filter_alone_is_better(monkey
     )  # fmt: skip
     monkeypatch.setattr(candidates.BaseWeights, "measured", lambda *_: torch.ones(100))
     monkeypatch.setattr(candidates.StartSearch, "_merge", lambda *_: torch.ones(50))
-    best, name = candidates.StartSearch(problem).best()
+    best, name = candidates.StartSearch(problem, start_clock(problem)).best()
     assert (best in reshaped) == forms and name == ("the closed form of merged splats" if forms else "merged splats")
 
 

@@ -3,10 +3,9 @@
 import math
 
 import pytest
-import tiny
 
 from mipmap_plugin.adaptation.optimization.validation import Quality
-from mipmap_plugin.adaptation.start.strength import Bounds, Merger
+from mipmap_plugin.adaptation.start.strength import Bounds, Candidate, Costs, Merger
 
 SPLATS, FORMED = 64, 30.0
 BOUNDS = Bounds(FORMED - 0.3, 0.0, FORMED)
@@ -21,10 +20,10 @@ def chosen(limited, coarse, *, learns=False, reached=0):
     def merge(power, coarsely):
         left = round(SPLATS * 16**-power)
         left, psnrs = (left, coarse) if coarsely else (max(left, reached), limited)
-        return tiny.model(left), Quality(*[psnrs.get(left, -math.inf)] * 2)
+        return Candidate(left, Quality(*[psnrs.get(left, -math.inf)] * 2), left)
 
-    found = Merger(merge, lambda power: math.ceil(SPLATS * 16**-power), 0.3, 0.0, learns).strongest(BOUNDS, None)
-    return None if found is None else len(found)
+    found = Merger(merge, lambda power: math.ceil(SPLATS * 16**-power), Costs(0.3, 0.3, learns)).strongest(BOUNDS)
+    return None if found is None else found.made
 
 
 @pytest.mark.parametrize(("learns", "splats"), [(False, 32), (True, 4)])

@@ -107,9 +107,9 @@ def test_settings_for_several_give_way_to_those_that_are_asked_for():
 def test_merged_splats_may_be_worse_than_the_base_where_steps_regain_it_in_several_viewers(monkeypatch, viewer, steps, may_lose):
     problems = []
 
-    def watched(self, problem):
+    def watched(self, problem, clock):
         problems.append(problem)
-        begin(self, problem)
+        begin(self, problem, clock)
 
     begin = StartSearch.__init__
     monkeypatch.setattr(StartSearch, "__init__", watched)
