@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from mipmap_plugin.commands.common import print_json, scene, without_none, wrap
+from mipmap_plugin.commands.common import print_json, scene, starting, without_none, wrap
 from mipmap_plugin.commands.pages import evaluation_page_path, look_at, write_evaluation_page
 from mipmap_plugin.commands.resuming import resumable, resume_path
 from mipmap_plugin.commands.types import BackendName, Background, Scales, ScreenFilter, Seed, Threads, Viewer, unique_scales
@@ -187,7 +187,8 @@ def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], cameras: Sequenc
             raise SettingsError(f"{option}: give {how}; got {len(given)}, for {len(checkpoint)} of these")
     if len(set(outputs)) < len(outputs):
         raise SettingsError(f"{outputs[0]}: the page is written there; give the rows another name, such as {outputs[0].with_suffix('.json')}")
-    from mipmap_plugin.models.outputs import parts_of
+    with starting():
+        from mipmap_plugin.models.outputs import parts_of
 
     read = [part for path in checkpoint for part in (parts_of(None, path) if path.is_dir() else [path])]
     read += [*(file for folder in images for file in folder.glob("transforms*.json")), *cameras]

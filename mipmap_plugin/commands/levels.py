@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mipmap_plugin.commands.common import without_none, wrap
+from mipmap_plugin.commands.common import starting, without_none, wrap
 from mipmap_plugin.commands.ladders import Exports, print_summary, saved
 from mipmap_plugin.commands.outputs import folder_of_several
 from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, Scale, ScreenFilter, Seed, Threads, Up, Viewer, Way
@@ -60,7 +60,8 @@ def levels(
         overwrite: Replace a ladder that exists.
         json: Print levels.json.
     """
-    from mipmap_plugin.levels.request import LadderRequest
+    with starting():
+        from mipmap_plugin.levels.request import LadderRequest
 
     exports = Exports(streamed_sog, tiles, canvas, checkpoint.resolve().name if report else None)
     exports.check(folder_of_several(output, (".ply", *WRITTEN, ".json")))

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from mipmap_plugin.commands.common import starting
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import MAX_SCALE, MIN_SCALE
 from mipmap_plugin.screen_filters import TrainedName
@@ -35,7 +36,8 @@ def unique_scales(scales: Sequence[float]) -> list[float]:
 
 def read_viewer(text: str) -> str:
     """The name of a viewer, which people write as its makers do, such as SuperSplat; a name that is not known is left as it is."""
-    from mipmap_plugin.splatting.viewers import NO_RECORD, VIEWERS
+    with starting():
+        from mipmap_plugin.splatting.viewers import NO_RECORD, VIEWERS
 
     names = {*VIEWERS.names(), *NO_RECORD}
     return text if text in names or text.lower() not in names else text.lower()

@@ -32,6 +32,21 @@ def test_long_work_is_announced_on_a_terminal_alone(terminal, patience, line, mo
     assert line in errors.getvalue() and bool(errors.getvalue()) == bool(line)
 
 
+def test_short_work_one_after_the_other_is_announced_when_together_it_takes_long(monkeypatch):
+    """A run has a dozen phases, on a slow machine each of nearly a second."""
+    monkeypatch.setattr(sys, "stderr", errors := Terminal())
+    monkeypatch.setattr(progress, "PATIENCE", 3600)
+    monkeypatch.setattr(progress, "PERIOD", 60)
+    monkeypatch.setattr(progress, "_silent_since", time.monotonic() - 3600)
+    monkeypatch.setattr(progress, "_ended_at", time.monotonic() - 1)
+    with progress.announced("merging"):
+        wait_until(lambda: "merging: " in errors.getvalue())
+    shown = errors.getvalue()
+    with progress.announced("writing"):
+        pass
+    assert errors.getvalue() == shown
+
+
 class Log:
     """What a program may put in the place of standard error, to have it in a file of its own."""
 
