@@ -11,15 +11,15 @@ from typing import Any
 
 from mipmap_plugin.commands.common import print_json
 from mipmap_plugin.commands.outputs import adapted_path
-from mipmap_plugin.commands.voice import say
-from mipmap_plugin.errors import JobsFailed, SettingsError, install, plural
+from mipmap_plugin.commands.voice import note, say
+from mipmap_plugin.errors import JobsFailed, SettingsError, install, plural, warn
 from mipmap_plugin.formats.here import from_here
 from mipmap_plugin.formats.staging import missing_folders, remove_empty
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.listing import find_checkpoints, is_pattern, read_list, shard, without_outputs
-from mipmap_plugin.jobs.summary import facts, in_order, table, totals
-from mipmap_plugin.progress import counted, note
+from mipmap_plugin.jobs.summary import facts, in_order, table, totals, warned
+from mipmap_plugin.progress import announced, counted
 
 NO_CHECKPOINT = "there is no checkpoint to adapt; give a PLY or a model folder, several of them, or --list FILE"
 
@@ -70,14 +70,15 @@ def adapt_many(many: Many, given: Sequence[Path], request: Request, base: Base, 
     `given`: checkpoints and patterns; `base`: how each checkpoint is read. Raises SettingsError before any work, JobsFailed and
     KeyboardInterrupt after it.
     """
-    jobs = make_jobs(many, given, request, base)
+    with announced("looking for checkpoints"):
+        jobs = make_jobs(many, given, request, base)
     outcomes: list[Outcome] = []
     missing = {folder for job in jobs for folder in missing_folders(job.target.parent)}
     try:
         with closing(engine(many, jobs, threads)) as running:
             for outcome in counted(running, len(jobs), "adapting", "job"):
                 outcomes.append(outcome)
-                note(str(outcome))
+                note(str(outcome), urgent=outcome.status == "failed")
     except KeyboardInterrupt as interrupt:
         _print(outcomes, jobs, json)
         again = " with --skip-existing" if request.overwrite and not many.skip_existing else ""
@@ -202,6 +203,8 @@ def _print(outcomes: Sequence[Outcome], jobs: Sequence[Job], json: bool) -> None
     sorted_outcomes = in_order(outcomes, jobs)
     if json:
         print_json(facts(sorted_outcomes))
-        return
-    say(table(sorted_outcomes))
-    say(totals(outcomes, len(jobs)))
+    else:
+        say(table(sorted_outcomes))
+        say(totals(outcomes, len(jobs)))
+    for text in warned(sorted_outcomes):
+        warn(text)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TextIO, cast
 
+from mipmap_plugin import progress
 from mipmap_plugin.commands.log import Log
 from mipmap_plugin.errors import OutputError, SettingsError
 
@@ -82,6 +83,14 @@ def put(text: str) -> None:
 def detail(text: str) -> None:
     """Write what few people need to the log only."""
     VOICE.get().write(text)
+
+
+def note(text: str, *, urgent: bool = False) -> None:
+    """Print a line about work that goes on to standard error, above its bars, unless the command is quiet and it is not `urgent`; also write it to
+    the log."""
+    VOICE.get().write(text)
+    if urgent or not VOICE.get().quiet:
+        progress.note(text)
 
 
 def complain(text: str) -> None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import time
 import traceback
+import warnings
 from dataclasses import replace
 
 from mipmap_plugin.adaptation.target.upsamplers import placed
-from mipmap_plugin.errors import MipmapPluginError, OutputExists, of_a_file
+from mipmap_plugin.errors import MipmapPluginError, OutputExists, hide_others_warnings, of_a_file
 from mipmap_plugin.jobs.finished import finished
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.limits import is_out_of_memory
@@ -16,11 +17,12 @@ from mipmap_plugin.models.zipped_folder import told
 
 
 def run(job: Job, threads: int | None = None) -> Outcome:
-    """Do a job; what is wrong with it becomes its outcome. An interrupted job raises KeyboardInterrupt, and continues when it is run again."""
+    """Do a job; what is wrong with it becomes its outcome, warnings too. Interrupted, it raises KeyboardInterrupt, and goes on when run again."""
     began = time.perf_counter()
-    with placed(job.settings.get("upsampler", ""), job.network):
+    with placed(job.settings.get("upsampler", ""), job.network), warnings.catch_warnings(record=True) as caught:
+        hide_others_warnings()
         outcome = _attempt(job, threads)
-    return replace(outcome, seconds=time.perf_counter() - began)
+    return replace(outcome, seconds=time.perf_counter() - began, warnings=tuple(told(each.message) for each in caught))
 
 
 def _attempt(job: Job, threads: int | None) -> Outcome:

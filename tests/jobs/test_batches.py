@@ -39,6 +39,28 @@ def test_what_a_job_failed_by_is_told_by_its_path_from_here(run, tmp_path, monke
     assert str(tmp_path) not in out + err
 
 
+@pytest.mark.parametrize("jobs", [[], ["--jobs", "2"]], ids=["in this process", "in workers"])
+def test_what_jobs_warn_of_is_told_of_each(run, tmp_path, monkeypatch, jobs):
+    """It was lost in workers, and in this process told of the first of them alone, without its name."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.ply", "b.ply"):
+        tiny.ply(tmp_path / name)
+    words = ["adapt", "a.ply", "b.ply", "--scale", "1/2", "--recipe", "instant", *jobs]
+    code, _, err = run(*words)
+    assert code == 0 and "mipmap-plugin: a.ply x0.5, b.ply x0.5: no cameras are known: " in err and err.count("no cameras") == 1
+    told = json.loads(run(*words, "--overwrite", "--json")[1])
+    assert all("no cameras are known" in each["warnings"][0] for each in told)
+
+
+def test_a_quiet_batch_tells_what_failed_and_its_log_tells_all(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tiny.folder(tmp_path / "a", tiny.cameras(3))
+    _, out, err = run("adapt", "a", "nowhere.ply", "--scale", "1/2", "--quiet", "--log", "log", *NO_STEP)
+    assert out == "" and "nowhere.ply x0.5: failed, nowhere.ply does not exist" in err and "a x0.5: done" not in err
+    log = (tmp_path / "log").read_text()
+    assert log.index("a x0.5: done") < log.index("2 jobs: 1 done, 1 failed")
+
+
 def test_jobs_that_fail_side_by_side_leave_no_empty_folder(run, scenes, tmp_path, monkeypatch):
     """Each of them removes what it made, but not what the other one had made before."""
 
