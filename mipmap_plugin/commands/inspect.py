@@ -113,7 +113,7 @@ def _seen_by(wrapped: Wrapped, given: Path | None) -> str:
         return f"{own}, of its base, in {place}" if place else own
     unread, orbit = unread_cameras(wrapped.model.source), wrapped.viewpoints.orbit
     none = f"none are read; {unread} may be of this scene" if unread else "none beside the checkpoint"
-    return f"{none}; it is looked at {orbit.told()}" if orbit.up else none
+    return f"{none}; {f'it is looked at {orbit.told()}' if orbit.up else 'give the scene (--cameras), or say what is up (--up z, for one)'}"
 
 
 def _verdict(wrapped: Wrapped, advice: str, health: Sequence[str], spoilt: bool, unseen: str) -> str:
@@ -152,8 +152,8 @@ def _advice(wrapped: Wrapped, checkpoint: Path, given: Path | None) -> str:
         words += ["--screen-filter", told]
     if given is None and not wrapped.cameras and (up := wrapped.asked.get("up")):
         words += ["--up", up]
-    elif given is not None or not wrapped.cameras:
-        words += ["--cameras", str(given or unread_cameras(wrapped.model.source) or "SCENE")]
+    elif cameras := given or (None if wrapped.cameras else unread_cameras(wrapped.model.source)):
+        words += ["--cameras", str(cameras)]
     return typed(words)
 
 

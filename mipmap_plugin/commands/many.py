@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mipmap_plugin.commands.common import print_json
+from mipmap_plugin.commands.common import print_json, starting
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.voice import note, say
 from mipmap_plugin.errors import JobsFailed, SettingsError, install, plural, warn
@@ -93,15 +93,15 @@ def adapt_many(many: Many, given: Sequence[Path], request: Request, base: Base, 
 def make_jobs(many: Many, given: Sequence[Path], request: Request, base: Base) -> list[Job]:
     """A job for each checkpoint, scale and viewer of this shard. Raises SettingsError if none of them can be right."""
     checkpoints = _checkpoints([*given, *(read_list(many.list) if many.list else [])])
-    several = many.is_list(given) or len(request.targets) > 1
     skip = many.skip_existing or not request.overwrite
-    jobs = [replace(job, skip_finished=skip) for path in checkpoints for job in jobs_of(path, request, base, several=several)]
-    _refuse(jobs)
+    jobs = [replace(job, skip_finished=skip) for path in checkpoints for job in jobs_of(path, request, base, several=many.is_list(given))]
+    refuse(jobs)
     return shard(jobs, *_part(many.shard))
 
 
-def jobs_of(checkpoint: Path, request: Request, base: Base, *, several: bool) -> list[Job]:
-    """The job of one checkpoint for each scale and viewer. `several`: the output is a folder for all."""
+def jobs_of(checkpoint: Path, request: Request, base: Base, *, several: bool = False) -> list[Job]:
+    """The job of one checkpoint for each scale and viewer. The output is a folder for all if there are several, or may be `several` checkpoints."""
+    several = several or len(request.targets) > 1
     own = replace(base, checkpoint=checkpoint.absolute(), cameras=_of_scene(base.cameras, checkpoint))
     settings, images = dict(request.settings), _of_scene(request.images, checkpoint)
     recipe, network, jobs = settings.pop("recipe"), Path(settings.get("upsampler", "")).absolute(), []
@@ -147,10 +147,11 @@ def _of_scene(path: Path | None, checkpoint: Path) -> Path | None:
     return path and Path(str(path).replace("{name}", name)).absolute()
 
 
-def _refuse(jobs: Sequence[Job]) -> None:
+def refuse(jobs: Sequence[Job]) -> None:
     """Raise the errors of settings that are wrong for every checkpoint, and SettingsError for two jobs with one output."""
-    from mipmap_plugin.backends import BACKENDS
-    from mipmap_plugin.splatting.viewers import viewers_for
+    with starting():
+        from mipmap_plugin.backends import BACKENDS
+        from mipmap_plugin.splatting.viewers import viewers_for
 
     if jobs[0].base.backend != "auto":
         BACKENDS.get(jobs[0].base.backend)

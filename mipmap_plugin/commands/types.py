@@ -30,7 +30,7 @@ def read_scale(text: str) -> float:
 def unique_scales(scales: Sequence[float]) -> list[float]:
     """The scales in their order, without repetitions. Raises SettingsError if there are none."""
     if not scales:
-        raise SettingsError("--scale is required; give --scale 1/4 or --scale 4, for example")
+        raise SettingsError("--scale is required; give --scale 1/4 or --scale 4, for example, or --scale 1 for no zoom")
     return list(dict.fromkeys(scales))
 
 
