@@ -18,8 +18,8 @@ from mipmap_plugin.formats.splat_transform import LOD_META, refuse_exchange
 from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
-    from mipmap_plugin.levels.contents import Contents as ZoomContents
-    from mipmap_plugin.levels.distance.manifest import Contents as DistanceContents
+    from mipmap_plugin.levels.contents import Contents
+    from mipmap_plugin.levels.distance.manifest import DistanceContents
     from mipmap_plugin.levels.request import LadderRequest
     from mipmap_plugin.wrap import Wrapped
 
@@ -47,7 +47,7 @@ class Exports:
             refuse_exchange(output)  # where it is not installed
             refuse_exchange(output / (LOD_META if self.streamed_sog else "tiles.spz"))  # where it is too old
 
-    def write(self, ladder: Path, contents: ZoomContents | DistanceContents) -> list[Path]:
+    def write(self, ladder: Path, contents: Contents | DistanceContents) -> list[Path]:
         """Write them into the folder of a ladder; return the files that viewers open, and the page at last."""
         from mipmap_plugin.levels.manifest import CANVAS
         from mipmap_plugin.levels.streamed import write_streamed

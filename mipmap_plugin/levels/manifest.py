@@ -44,17 +44,9 @@ def refuse_ladder(folder: Path, base: FrozenBase, *, overwrite: bool, room: int 
     refuse_unwritable(folder, room, what="the levels take about", why=", with what is kept of them until all are done")
 
 
-def write_ladder(ladder: Contents, folder: Path, overwrite: bool) -> Path:
-    """`write_levels` of a ladder by zoom."""
-    refuse_ladder(folder, ladder.base, overwrite=overwrite)
-    return write_levels([level.adapted for level in ladder.levels], lambda files: manifest(ladder, files), folder, overwrite)
-
-
 def write_levels(levels: Sequence[Adapted], manifest_of: Callable[[list[Path]], dict[str, Any]], folder: Path, overwrite: bool) -> Path:
-    """Write the levels, a report beside each, and the manifest; the folder appears complete or not at all. Raises OutputExists, OutputError.
-
-    `manifest_of`: makes the manifest of the levels' files.
-    """
+    """Write the levels, a report beside each, and the manifest of their files; the folder appears complete or not at all. Raises OutputExists,
+    OutputError."""
     with new_folder(folder, overwrite) as temporary:
         files = [level.save(temporary / level_name(number)) for number, level in enumerate(levels)]
         write_json(temporary / MANIFEST, manifest_of(files), overwrite=False)

@@ -10,7 +10,7 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import plural
 from mipmap_plugin.evaluation.metrics import psnr
-from mipmap_plugin.levels.distance.manifest import Contents
+from mipmap_plugin.levels.distance.manifest import DistanceContents
 from mipmap_plugin.levels.distance.walks import focal_of
 from mipmap_plugin.levels.distance.yardstick import Seen, WalkPoint, Walks
 from mipmap_plugin.levels.yardstick import VIEWS
@@ -22,7 +22,7 @@ from mipmap_plugin.pages.record import Page, Picture, Role, Zoom
 TRUTH = "the supersampled base (no photographs)"
 
 
-def walks_page(title: str, ladder: Contents, manifest: dict[str, Any], commands: Sequence[str]) -> Page:
+def walks_page(title: str, ladder: DistanceContents, manifest: dict[str, Any], commands: Sequence[str]) -> Page:
     """The page of a ladder and its manifest (`levels.distance.manifest`): pictures of a walk where it begins, where what is nearest is in the middle
     of each level, and at the end."""
     scene, walks, zooms = ladder.scene, Walks(ladder.scene, [level.model for level in ladder.levels]), dict[float, Zoom]()
@@ -36,7 +36,7 @@ def walks_page(title: str, ladder: Contents, manifest: dict[str, Any], commands:
     return Page(title, text, commands, list(zooms.values())[::-1], ladder=manifest, effects=effects, provenance=manifest["versions"])
 
 
-def _zoom(ladder: Contents, view: Camera, seen: Seen, point: WalkPoint) -> Zoom:
+def _zoom(ladder: DistanceContents, view: Camera, seen: Seen, point: WalkPoint) -> Zoom:
     """The base in the viewer, the levels as it mixes them, and the supersampled base. `point`: the means of all walks."""
     scale = 1 - seen.way / (seen.pixel * focal_of(view))
     base = _picture(f"base in {ladder.scene.request.viewer}", "base", seen.base, seen, point.base_db, len(ladder.scene.splats))
