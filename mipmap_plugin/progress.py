@@ -118,6 +118,7 @@ def _show(what: str, ended: threading.Event) -> None:
         return
     with Bar(bar_format="{desc}: {elapsed}", desc=what, leave=False) as line:
         line.start_t -= patience
+        _silent_since = time.monotonic()
         while not ended.wait(PERIOD):
             line.refresh()
-    _silent_since = time.monotonic()
+            _silent_since = time.monotonic()
