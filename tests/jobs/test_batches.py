@@ -3,6 +3,7 @@
 import json
 import os
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import tiny
@@ -59,6 +60,14 @@ def test_a_quiet_batch_tells_what_failed_and_its_log_tells_all(run, tmp_path, mo
     assert out == "" and "nowhere.ply x0.5: failed, nowhere.ply does not exist" in err and "a x0.5: done" not in err
     log = (tmp_path / "log").read_text()
     assert log.index("a x0.5: done") < log.index("2 jobs: 1 done, 1 failed")
+
+
+def test_a_job_that_is_interrupted_in_this_process_is_in_the_table(run, scenes, monkeypatch):
+    """It was said not to have begun."""
+    monkeypatch.setattr(Wrapped, "adapt", Mock(side_effect=KeyboardInterrupt("interrupted at step 7")))
+    code, out, err = run("adapt", scenes / "chair", scenes / "lego", "--scale", "1/2")
+    assert code == 130 and "chair x0.5: interrupted at step 7" in err
+    assert "  interrupted at step 7\n" in out and out.endswith("2 jobs: 1 interrupted, 1 not begun\n")
 
 
 def test_jobs_that_fail_side_by_side_leave_no_empty_folder(run, scenes, tmp_path, monkeypatch):
