@@ -193,6 +193,15 @@ def test_what_no_viewer_draws_has_no_levels(tmp_path, write, by):
         make_levels(base, request("supersplat", by=by))
 
 
+def test_no_level_advises_to_leave_out_the_viewer_that_a_ladder_needs(monkeypatch, recwarn):
+    monkeypatch.setattr("mipmap_plugin.adaptation.session.psnr_as_trained", lambda *_: 99.0)
+    advice = "adapt without a viewer"
+    wrapped().adapt(1 / 2, viewer="antialiased", **BRIEF)
+    assert advice in str(recwarn.pop(UserWarning).message)
+    ladder = make_levels(wrapped(), request(coarsest=1 / 2))
+    assert not any(advice in str(each.message) for each in recwarn) and advice not in str([level.adapted.report.notes for level in ladder.levels])
+
+
 def test_the_command_does_not_advise_to_leave_out_the_viewer_that_it_needs(tmp_path, capsys):
     base = moving.write_deformable(tmp_path / "base")
     assert cli.main(["levels", str(base), "--viewer", "spark", "--output", str(tmp_path / "ladder")]) == 2
