@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mipmap_plugin.commands.common import print_json
+from mipmap_plugin.commands.common import print_json, starting
 from mipmap_plugin.commands.many import Many, Request, engine, finished_before, jobs_of
 from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.errors import SettingsError, plural
@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 
 def adapt_tiled(many: Many, given: Sequence[Path], request: Request, base: Base, threads: int | None, json: bool) -> None:
     """Adapt one checkpoint to each scale and viewer in tiles. Raises SettingsError before any work, JobsFailed."""
-    from mipmap_plugin.tiles.plan import unlock
-    from mipmap_plugin.tiles.run import adapt_all_in_tiles
+    with starting():
+        from mipmap_plugin.tiles.plan import unlock
+        from mipmap_plugin.tiles.run import adapt_all_in_tiles
 
     if many.tiles is None or many.is_list(given) or many.shard is not None:
         raise SettingsError("--tiles cuts one checkpoint; give that one, without --list and --shard")
