@@ -132,13 +132,12 @@ def _jobs(base: Base, request: Request) -> list[Job]:
     return jobs
 
 
-def _check(wrapped: Wrapped, jobs: Sequence[Job]) -> None:
-    """Raise now what adapting and saving would raise, as far as it can be predicted."""
+def _check(base: Wrapped, jobs: Sequence[Job]) -> None:
+    """Raise now what making the files would raise, as far as it can be predicted."""
+    from mipmap_plugin.jobs.run import check
+
     for job in jobs:
-        config = job.config()
-        wrapped.targets(job.viewer)
-        networks_move = config.steps > 0 and config.rates.networks > 0
-        wrapped.refuse_output(job.target, overwrite=job.overwrite, networks_move=networks_move, viewer=job.viewer)
+        check(base, job)
 
 
 def _made(base: Wrapped, jobs: Sequence[Job], photographs: Scene | None, page: AdaptationPage | None, quiet: bool) -> list[Facts]:

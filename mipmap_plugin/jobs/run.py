@@ -14,6 +14,7 @@ from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.limits import is_out_of_memory
 from mipmap_plugin.models.places import state_path
 from mipmap_plugin.models.zipped_folder import told
+from mipmap_plugin.wrap import Wrapped
 
 
 def run(job: Job, threads: int | None = None) -> Outcome:
@@ -49,11 +50,16 @@ def _finished_before(job: Job) -> Outcome | None:
 def _adapt(job: Job, threads: int | None) -> Outcome:
     base = job.base.load(threads)
     base.keeps_images = False
-    config = job.config()
-    base.targets(job.viewer)
-    networks_move = config.steps > 0 and config.rates.networks > 0
-    base.refuse_output(job.target, overwrite=job.overwrite, networks_move=networks_move, viewer=job.viewer)
+    check(base, job)
     scene = None if job.images is None else job.base.photographs(job.images)
     adapted = base.adapt(job.scale, recipe=job.recipe, viewer=job.viewer, resume=state_path(job.target), images=scene, **job.settings)
     file = adapted.save(job.target, overwrite=job.overwrite)
     return Outcome(job, "done", file, adapted.report_of(file).model_dump())
+
+
+def check(base: Wrapped, job: Job) -> None:
+    """Raise now what adapting a loaded base and saving the result would raise, as far as it can be predicted."""
+    config = job.config()
+    base.targets(job.viewer)
+    networks_move = config.steps > 0 and config.rates.networks > 0
+    base.refuse_output(job.target, overwrite=job.overwrite, networks_move=networks_move, viewer=job.viewer)
