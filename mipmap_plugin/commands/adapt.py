@@ -12,6 +12,7 @@ import tyro
 
 from mipmap_plugin.commands.common import print_json, scene, without_none, wrap
 from mipmap_plugin.commands.many import NO_CHECKPOINT, Many, Request, adapt_many, finished_before, jobs_of, refuse
+from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.pages import AdaptationPage, look_at
 from mipmap_plugin.commands.terminal_picture import show_before_and_after
 from mipmap_plugin.commands.tiled import adapt_tiled
@@ -23,6 +24,7 @@ from mipmap_plugin.formats.atomic import together
 from mipmap_plugin.formats.here import from_here
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job
+from mipmap_plugin.jobs.listing import is_output
 from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
@@ -126,10 +128,13 @@ def _refuse_for_many(given: bool, scales: Sequence[float], size: str | None, pag
 
 
 def _jobs(base: Base, request: Request) -> list[Job]:
-    """What is made for each scale and viewer. Raises the errors of settings, and SettingsError for two files with the same path."""
-    jobs = jobs_of(base.checkpoint, request, base)
-    refuse(jobs)
-    return jobs
+    """What is made for each scale and viewer. Raises the errors of settings, and SettingsError for two files with the same path, or a folder's."""
+    job, *others = jobs_of(base.checkpoint, request, base)
+    refuse([job, *others])
+    if not others and not request.overwrite and job.target.is_dir() and not is_output(job.target):
+        within = adapted_path(base.checkpoint, job.target, job.scale, job.viewer, several=True)
+        raise SettingsError(f"{job.target} is a folder; give the path of what is to be written, such as {within}")
+    return [job, *others]
 
 
 def _check(base: Wrapped, jobs: Sequence[Job]) -> None:

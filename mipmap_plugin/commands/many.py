@@ -160,7 +160,7 @@ def refuse(jobs: Sequence[Job]) -> None:
     for job in jobs:
         job.config()
         if job.overwrite and (base := bases.get(job.target.resolve())):
-            raise SettingsError(f"{from_here(job.target)} holds a checkpoint that is to be adapted too ({from_here(base)}); choose another --output")
+            raise SettingsError(f"{from_here(job.target)} holds a checkpoint that is to be adapted ({from_here(base)}); choose another --output")
         if job.viewer is not None:
             viewers_for(job.viewer)
         if (other := makers.setdefault(job.target, job)) is not job:
