@@ -163,7 +163,7 @@ def _show(text: str, said: set[str]) -> None:
     """Show a warning without its place in the source, and once: all levels of a ladder, and all scales of a checkpoint, warn of the same."""
     if text not in said:
         said.add(text)
-        voice.complain(f"mipmap-plugin: {_told(text)}")
+        voice.note(f"mipmap-plugin: {_told(text)}", urgent=True)
 
 
 def _told(words: object) -> str:

@@ -90,11 +90,12 @@ def note(text: str, *, urgent: bool = False) -> None:
     the log."""
     VOICE.get().write(text)
     if urgent or not VOICE.get().quiet:
-        progress.note(text)
+        with contextlib.suppress(OSError):  # who reads it may have gone
+            progress.note(text)
 
 
 def complain(text: str) -> None:
-    """Print what went wrong on standard error, quiet or not; also write it to the log."""
+    """Print why a command ends on standard error, quiet or not; also write it to the log."""
     VOICE.get().write(text.strip())
     with contextlib.suppress(OSError):  # the exit code says it too
         print(text, file=sys.stderr)

@@ -11,6 +11,8 @@ import tiny
 from running import wait_until
 
 from mipmap_plugin import progress
+from mipmap_plugin.cli import _our_warnings_only
+from mipmap_plugin.errors import warn
 from mipmap_plugin.wrap import wrap_model
 
 pytestmark = pytest.mark.usefixtures("few_views")
@@ -91,6 +93,15 @@ def test_the_clock_of_a_bar_goes_on_while_nothing_is_counted(monkeypatch):
     with progress.Bar(total=2) as bar, progress.ticking(bar):
         time.sleep(0.05)
     assert not silent.getvalue()
+
+
+def test_a_warning_has_a_line_of_its_own_above_a_bar(monkeypatch):
+    """It was appended to what the bar showed."""
+    monkeypatch.setattr(sys, "stderr", errors := Terminal())
+    with progress.Bar(total=2, desc="adapting"), _our_warnings_only():
+        errors_before = errors.getvalue()
+        warn("mind this")
+    assert "adapting" in errors_before and "\rmipmap-plugin: mind this\n" in errors.getvalue()
 
 
 def test_a_terminal_that_knows_no_size_shows_bars(monkeypatch):
