@@ -131,9 +131,10 @@ def _jobs(base: Base, request: Request) -> list[Job]:
     """What is made for each scale and viewer. Raises the errors of settings, and SettingsError for two files with the same path, or a folder's."""
     job, *others = jobs_of(base.checkpoint, request, base)
     refuse([job, *others])
-    if not others and not request.overwrite and job.target.is_dir() and not is_output(job.target):
-        within = adapted_path(base.checkpoint, job.target, job.scale, job.viewer, several=True)
-        raise SettingsError(f"{job.target} is a folder; give the path of what is to be written, such as {within}")
+    output = None if others or request.overwrite else request.output
+    if output and output.is_dir() and not is_output(output):
+        within = adapted_path(base.checkpoint, output, job.scale, job.viewer, several=True)
+        raise SettingsError(f"{output} is a folder; give the path of what is to be written, such as {within}")
     return [job, *others]
 
 
