@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from mipmap_plugin.commands.common import starting, without_none, wrap
-from mipmap_plugin.commands.ladders import Exports, print_summary, saved
+from mipmap_plugin.commands.ladder_summary import print_summary
+from mipmap_plugin.commands.ladders import Exports, saved
 from mipmap_plugin.commands.outputs import folder_of_several
 from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, Scale, ScreenFilter, Seed, Threads, Up, Viewer, Way
 from mipmap_plugin.config import ViewPolicy

@@ -14,7 +14,7 @@ from exchange_files import answer_by
 from two_levels import CHUNKS, LADDER
 
 from mipmap_plugin import cli
-from mipmap_plugin.commands.ladders import _below
+from mipmap_plugin.commands.ladder_summary import _below
 from mipmap_plugin.errors import OutputError, OutputExists, SettingsError
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.streamed_sog import read_chunks
