@@ -15,11 +15,6 @@ from mipmap_plugin.formats.atomic import settled
 CELL = re.compile(r"[0-9a-f]{24}\.pt|\.[0-9a-f]{24}\.pt\.\d\.tmp")
 
 
-def resume_path(output: Path) -> Path:
-    """The folder with the finished cells of a command that writes to `output`."""
-    return output.with_name(f"{output.name}.resume")
-
-
 @contextmanager
 def resumable(folder: Path | None, unit: str) -> Iterator[None]:
     """Say what an earlier command left in `folder`; inside, Ctrl-C says how many cells are finished, and how to go on. `unit`: what a cell is.

@@ -28,11 +28,6 @@ CANVAS = 1080
 WRITTEN = (MANIFEST, "level_*.ply", f"level_*.ply{REPORT}", "report.html", "streamed/*", "tiles/*")
 
 
-def level_name(number: int) -> str:
-    """The file of a level; 0 is the finest, as in other tools."""
-    return f"level_{number}.ply"
-
-
 def refuse_ladder(folder: Path, base: FrozenBase, *, overwrite: bool, room: int = 0) -> None:
     """Raise what writing a ladder to `folder` would raise. A folder with other things in it is never replaced. Raises OutputExists, OutputError.
 
@@ -48,7 +43,7 @@ def write_levels(levels: Sequence[Adapted], manifest_of: Callable[[list[Path]], 
     """Write the levels, a report beside each, and the manifest of their files; the folder appears complete or not at all. Raises OutputExists,
     OutputError."""
     with new_folder(folder, overwrite) as temporary:
-        files = [level.save(temporary / level_name(number)) for number, level in enumerate(levels)]
+        files = [level.save(temporary / f"level_{number}.ply") for number, level in enumerate(levels)]  # 0 is the finest, as in other tools
         write_json(temporary / MANIFEST, manifest_of(files), overwrite=False)
     return folder
 
