@@ -6,6 +6,7 @@ import re
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from os.path import realpath  # of a link to itself too, at which `Path.resolve` fails
 from pathlib import Path
 from typing import Any
 
@@ -142,7 +143,7 @@ def _checkpoints(given: Sequence[Path]) -> list[Path]:
 
 def _of_scene(path: Path | None, checkpoint: Path) -> Path | None:
     """A path in which {name} stands for the checkpoint's name."""
-    place = checkpoint.resolve()
+    place = Path(realpath(checkpoint))
     name = place.stem if place.is_file() else place.name
     return path and Path(str(path).replace("{name}", name)).absolute()
 
@@ -156,11 +157,11 @@ def refuse(jobs: Sequence[Job]) -> None:
     if jobs[0].base.backend != "auto":
         BACKENDS.get(jobs[0].base.backend)
     makers: dict[Path, Job] = {}
-    bases = {folder: job.base.checkpoint for job in jobs for folder in (job.base.checkpoint.resolve() / "x").parents}
+    bases = {folder: job.base.checkpoint for job in jobs for folder in Path(realpath(job.base.checkpoint), "x").parents}
     for job in jobs:
         job.config()
-        if job.overwrite and (base := bases.get(job.target.resolve())):
-            raise SettingsError(f"{from_here(job.target)} holds a checkpoint that is to be adapted ({from_here(base)}); choose another --output")
+        if job.overwrite and (base := bases.get(Path(realpath(job.target)), job.base.checkpoint)) != job.base.checkpoint:
+            raise SettingsError(f"{from_here(job.target)} holds a checkpoint that is to be adapted too ({from_here(base)}); choose another --output")
         if job.viewer is not None:
             viewers_for(job.viewer)
         if (other := makers.setdefault(job.target, job)) is not job:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from itertools import count as count_from
+from os.path import realpath
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,7 +26,7 @@ def adapted_path(checkpoint: Path, output: Path | None, scale: float, viewer: st
 
     name = adapted_name(checkpoint, scale, viewer)
     if output is None:
-        return checkpoint.resolve().parent / name
+        return Path(realpath(checkpoint)).parent / name
     return folder_of_several(output, (".ply", *WRITTEN)) / name if several else output
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import glob
 from collections.abc import Iterable, Sequence
+from os.path import realpath
 from pathlib import Path
 from typing import TypeVar
 
@@ -37,7 +38,7 @@ def find_checkpoints(given: Iterable[Path]) -> list[Path]:
     found: dict[Path, Path] = {}
     for path in given:
         for each in _matches(path) if is_pattern(path) else [path]:
-            found.setdefault(each.resolve(), each)
+            found.setdefault(Path(realpath(each)), each)
     return list(found.values())
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from mipmap_plugin.errors import MipmapPluginError
@@ -27,7 +28,7 @@ def adapted_name(checkpoint: Path, scale: float, viewer: str | None = None) -> s
     as a PLY for a viewer that does not read that, and files of third-party families as these say (`Family.saves`), but as a PLY for any. What gsplat
     and nerfstudio save becomes a folder of theirs, but a PLY for a viewer of others.
     """
-    name = checkpoint.resolve().name
+    name = os.path.basename(os.path.realpath(checkpoint))
     read, written = _endings(checkpoint, name, viewer)
     return f"{name[: len(name) - len(read)]}_x{scale:g}{f'_{viewer}' if viewer else ''}{written}"
 

@@ -87,8 +87,15 @@ def test_no_job_replaces_the_base_of_another(run, tmp_path):
         tiny.ply(tmp_path / name, seed=seed)
     before = (tmp_path / "a_x0.5.ply").read_bytes()
     code, _, err = run("adapt", tmp_path / "a.ply", tmp_path / "a_x0.5.ply", "--scale", "1/2", "--overwrite", *NO_STEP)
-    assert code == 2 and "a_x0.5.ply holds a checkpoint that is to be adapted (" in err
+    assert code == 2 and "a_x0.5.ply holds a checkpoint that is to be adapted too" in err
     assert (tmp_path / "a_x0.5.ply").read_bytes() == before
+
+
+@pytest.mark.parametrize("more", [[], ["--jobs", "1"], ["--overwrite"]], ids=" ".join)
+def test_a_link_to_itself_is_no_checkpoint(run, tmp_path, more):
+    (tmp_path / "loop.ply").symlink_to("loop.ply")
+    code, out, err = run("adapt", tmp_path / "loop.ply", "--scale", "1/2", *more)
+    assert code == 2 and "loop.ply" in err and "Traceback" not in out + err
 
 
 def test_this_folder_is_a_checkpoint_too(run, scenes, monkeypatch):
