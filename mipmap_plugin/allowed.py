@@ -30,6 +30,10 @@ def _whole(value: Any, least: int) -> bool:
     return isinstance(value, Integral) and int(value) >= least
 
 
+def _degree(value: Any) -> bool:
+    return type(value) is int and 0 <= value <= 4
+
+
 def _color(value: Any) -> bool:
     return isinstance(value, (tuple, list)) and len(value) == 3 and all(_number(part) and math.isfinite(part) for part in value)
 
@@ -94,13 +98,9 @@ OF_PACKING: Mapping[str, Rule] = {
 OF_VIEWER: Mapping[str, Rule] = {
     "eps2d": ("a dilation in px² from 0 to 10,000", lambda value: _number(value) and 0 <= value <= 1e4),
     "near_plane": SIZE,
-    "sh_degree": ("a whole number from 0 to 4", lambda value: _degree(value)),
+    "sh_degree": ("a whole number from 0 to 4", _degree),
     "read_degrees": ("whole numbers from 0 to 4, at least one", lambda value: isinstance(value, tuple) and value != () and all(map(_degree, value))),
 }
-
-
-def _degree(value: Any) -> bool:
-    return type(value) is int and 0 <= value <= 4
 
 
 def check(what: str, record: Any, rules: Mapping[str, Rule], optional: frozenset[str]) -> None:

@@ -29,7 +29,7 @@ from mipmap_plugin.commands.repeated import refuse_repeated
 from mipmap_plugin.commands.tradeoff import tradeoff
 from mipmap_plugin.commands.types import RULES
 from mipmap_plugin.commands.view import view
-from mipmap_plugin.errors import MipmapPluginError, MipmapPluginWarning, SettingsError, of_a_file
+from mipmap_plugin.errors import MipmapPluginError, SettingsError, hide_others_warnings, of_a_file
 from mipmap_plugin.formats.here import told_from_here
 from mipmap_plugin.limits import is_out_of_memory
 from mipmap_plugin.process.freed_memory import keep_freed_memory
@@ -152,12 +152,9 @@ def _run(words: Sequence[str]) -> int:
 
 @contextlib.contextmanager
 def _our_warnings_only() -> Iterator[None]:
-    """Hide other libraries' warnings, which are meant for programmers; `python -W` still shows all."""
+    """Show this package's warnings in a line each, and hide those of others."""
     with warnings.catch_warnings():
-        if not sys.warnoptions:
-            warnings.simplefilter("ignore")
-            warnings.filterwarnings("default", module=r"mipmap_plugin(\.|$)")
-            warnings.filterwarnings("default", category=MipmapPluginWarning)
+        hide_others_warnings()
         said: set[str] = set()
         warnings.showwarning = lambda message, *_: _show(str(message), said)
         yield
@@ -167,7 +164,7 @@ def _show(text: str, said: set[str]) -> None:
     """Show a warning without its place in the source, and once: all levels of a ladder, and all scales of a checkpoint, warn of the same."""
     if text not in said:
         said.add(text)
-        voice.complain(f"mipmap-plugin: {_told(text)}")
+        voice.note(f"mipmap-plugin: {_told(text)}", urgent=True)
 
 
 def _told(words: object) -> str:

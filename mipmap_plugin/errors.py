@@ -80,6 +80,14 @@ def warn(text: str, category: type[Warning] = MipmapPluginWarning) -> None:
     warnings.warn(text, category, stacklevel=max(ours, default=0) + 3)
 
 
+def hide_others_warnings() -> None:
+    """Inside `warnings.catch_warnings`, hide other libraries' warnings, which are meant for programmers; `python -W` still shows all."""
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("default", module=rf"{PACKAGE}(\.|$)")
+        warnings.filterwarnings("default", category=MipmapPluginWarning)
+
+
 # What the names of temporary folders begin with.
 TEMPORARY = "mipmap-plugin-"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from typing import Any, TypeVar
@@ -15,6 +16,9 @@ Item = TypeVar("Item")
 
 # Seconds before anything is shown, and between two looks at the clock.
 PATIENCE, PERIOD = 1.0, 0.5
+
+# Since when nothing is shown, and when the last announced block ended: of short blocks one after the other the silence together is long.
+_silent_since = _ended_at = -PERIOD
 
 # The size that a terminal is taken to have which does not know its own (VT100). tqdm shows nothing there.
 COLUMNS, LINES = 80, 24
@@ -70,9 +74,16 @@ def note(line: str) -> None:
 
 @contextmanager
 def announced(what: str) -> Iterator[None]:
-    """Show `what` and its seconds on standard error while the block runs, once it has taken a second; nothing where that is no terminal."""
-    with nullcontext() if hidden() else meanwhile(lambda ended: _show(what, ended)):
-        yield
+    """Show `what` and its seconds on standard error while the block runs, once nothing was shown for a second, in this block and in others right
+    before it; nothing where that is no terminal."""
+    global _silent_since, _ended_at
+    if time.monotonic() - _ended_at > PERIOD:
+        _silent_since = time.monotonic()
+    try:
+        with nullcontext() if hidden() else meanwhile(lambda ended: _show(what, ended)):
+            yield
+    finally:
+        _ended_at = time.monotonic()
 
 
 @contextmanager
@@ -101,9 +112,13 @@ def meanwhile(work: Callable[[threading.Event], None]) -> Iterator[None]:
 
 
 def _show(what: str, ended: threading.Event) -> None:
-    if ended.wait(PATIENCE):
+    global _silent_since
+    patience = max(0.0, _silent_since + PATIENCE - time.monotonic())
+    if ended.wait(patience):
         return
     with Bar(bar_format="{desc}: {elapsed}", desc=what, leave=False) as line:
-        line.start_t -= PATIENCE
+        line.start_t -= patience
+        _silent_since = time.monotonic()
         while not ended.wait(PERIOD):
             line.refresh()
+            _silent_since = time.monotonic()

@@ -122,8 +122,7 @@ class Session:
         initial, start, notes = best_start(self._start_problems())
         self.notes = [note for note in notes if note == UNMATCHED or not (self.finer and self.finer.converts)]
         states = {AS_IT_IS: self._for_target(self.request.base_in_viewer, shared=True), f"the start, {start}": initial}
-        curve: list[CurvePoint] = []
-        ended_by = "0 steps" + fewer_note(self.asked.steps, self.config.model_copy(update={"steps": 0}))
+        curve, ended_by = list[CurvePoint](), "0 steps" + fewer_note(self.asked.steps, self.config.model_copy(update={"steps": 0}))
         pool.release_to_system()
         self.seconds["total"] = now(self.device) - began
         if self._takes_steps:
@@ -271,7 +270,8 @@ class Session:
         notes = [*self.notes, *(note for note in student.notes if note not in known)]
         as_trained = psnr_as_trained(self.validation, self.backend, self.drawn.targets, self.base, self.drawn.base)
         shown = next((psnr for state, psnr in validation.items() if returned.startswith(state)), 0.0)
-        notes += better_as_trained(as_trained, shown, self.drawn.base)
+        alone = as_trained if self.config.band == (1.0, 1.0) else None  # else it is a level of a ladder, which there is for viewers alone
+        notes += better_as_trained(alone, shown, self.drawn.base)
         for note in notes:
             warn(note)
         return Report(

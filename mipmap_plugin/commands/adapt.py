@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from mipmap_plugin.commands.common import print_json, scene, without_none, wrap
-from mipmap_plugin.commands.many import NO_CHECKPOINT, Many, Request, adapt_many, finished_before, jobs_of
+from mipmap_plugin.commands.many import NO_CHECKPOINT, Many, Request, adapt_many, finished_before, jobs_of, refuse
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.pages import AdaptationPage, look_at
 from mipmap_plugin.commands.terminal_picture import show_before_and_after
@@ -24,14 +24,15 @@ from mipmap_plugin.formats.atomic import together
 from mipmap_plugin.formats.here import from_here
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job
-from mipmap_plugin.recipes import recipe as make_config
+from mipmap_plugin.jobs.listing import is_output
+from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
     from mipmap_plugin.adaptation.report import Report
     from mipmap_plugin.models.base import SplatModel
+    from mipmap_plugin.scenes import Scene
     from mipmap_plugin.wrap import Wrapped
 
-File = tuple[float, str | None, Path]  # its scale, the viewer that it is for, and where it is written
 Facts = dict[str, Any]  # a report as JSON, with the path of its file
 
 
@@ -79,7 +80,7 @@ def adapt(
 
     Args:
         checkpoints: A PLY, .spz, .sog, .splat or .glb, or a model folder; or several, also as patterns such as "output/*".
-        scale: Target focal length over base focal length, such as 1/4 or 4; may be given several times. Required without --splats or --bytes.
+        scale: Target focal length over the base's: 1/4, 4, or 1 for a viewer alone; several: a file each; required without --splats or --bytes.
         output: Where to write; by default beside the checkpoint, as NAME_x0.25. With several scales or viewers: a folder for all files.
         recipe: default; thorough (more steps and views); instant (closed form only, seconds); paper (the published method); or a registered one.
         viewer: Viewer to make the file for: classic, spark, ...; portable: all; several: a file each. By default what draws as the training did.
@@ -94,23 +95,23 @@ def adapt(
     if many.tiles is not None or many.asked(checkpoints):
         _refuse_for_many(bool(checkpoints or many.list), scale, bytes, report)
         request = Request(_requests(scale, viewer), output, settings | without_none(most_splats=splats), images, overwrite)
-        adapt_jobs = adapt_many if many.tiles is None else adapt_tiled
-        return adapt_jobs(many, checkpoints, request, base, threads, json)
+        return (adapt_many if many.tiles is None else adapt_tiled)(many, checkpoints, request, base, threads, json)
     [checkpoint] = checkpoints
-    wrapped = wrap(replace(base, checkpoint=checkpoint), threads, images)
-    most = _most(wrapped, (splats, bytes), (checkpoint, output), (scale, viewer), settings)
-    settings, requests = settings | without_none(most_splats=most), _requests(scale or _fitting(wrapped.model, most), viewer)
-    files = _files(checkpoint, output, requests)
-    before = _finished(jobs_of(checkpoint, Request(requests, output, settings, images, overwrite), base, several=len(files) > 1), files, json)
-    left = [file for file in files if file[2] not in before]
-    _check(wrapped, left, settings, overwrite)
-    page = AdaptationPage(checkpoint, [target for *_, target in files], overwrite) if report else None
-    photographs = images and scene(replace(base, checkpoint=checkpoint), images)
-    made = _made(wrapped, left, settings | dict(images=photographs), page, overwrite, json)
+    base, limited = replace(base, checkpoint=checkpoint), splats is not None or bytes is not None
+    request = Request(_requests(scale or ([1.0] if limited else ()), viewer), output, settings, images, overwrite)
+    jobs = _jobs(base, request)  # raises what it can before the checkpoint is read, which may take long
+    wrapped = wrap(base, threads, images)
+    if limited:
+        jobs = _jobs(base, _limited(request, wrapped, jobs, (splats, bytes), fits=not scale))
+    before = {} if overwrite or len(jobs) == 1 else finished_before(jobs, json)  # a single file is made or refused
+    left = [job for job in jobs if job.target not in before]
+    _check(wrapped, left)
+    page = AdaptationPage(checkpoint, [job.target for job in jobs], overwrite) if report else None
+    made = _made(wrapped, left, None if images is None else scene(base, images), page, json)
     if page and not page.of_one:
         page.write(made, [*before.values()])
     if json:
-        print_json([before.get(file[2]) or made.pop(0) for file in files])
+        print_json([before.get(job.target) or made.pop(0) for job in jobs])
     elif page:
         say(look_at(page.path))
 
@@ -126,46 +127,42 @@ def _refuse_for_many(given: bool, scales: Sequence[float], size: str | None, pag
         raise SettingsError(f"--bytes and --report are for one checkpoint at a time, without {jobs}; leave out these or those")
 
 
-def _files(checkpoint: Path, output: Path | None, requests: Sequence[tuple[float, str | None]]) -> list[File]:
-    """What is made for each scale and viewer. Raises SettingsError for two of them with the same path."""
-    files = [(*request, adapted_path(checkpoint, output, *request, several=len(requests) > 1)) for request in requests]
-    targets = [target for *_, target in files]
-    if twice := [target for number, target in enumerate(targets) if target in targets[:number]]:
-        raise SettingsError(f"two scales would both be written to {twice[0]}; give scales that differ more, or adapt to them one by one")
-    return files
+def _jobs(base: Base, request: Request) -> list[Job]:
+    """What is made for each scale and viewer. Raises the errors of settings, and SettingsError for two files with the same path, or a folder's."""
+    job, *others = jobs_of(base.checkpoint, request, base)
+    refuse([job, *others])
+    output = None if others or request.overwrite else request.output
+    if output and output.is_dir() and not is_output(output):
+        within = adapted_path(base.checkpoint, output, job.scale, job.viewer, several=True)
+        raise SettingsError(f"{output} is a folder; give the path of what is to be written, such as {within}")
+    return [job, *others]
 
 
-def _finished(jobs: Sequence[Job], files: Sequence[File], json: bool) -> dict[Path, Facts]:
-    """The reports of files that an interrupted command has written; none of a single file, which is made or refused. `jobs`: what would make each."""
-    if len(files) == 1 or jobs[0].overwrite:
-        return {}
-    return finished_before([replace(job, target=target) for job, (*_, target) in zip(jobs, files, strict=True)], json)
+def _check(base: Wrapped, jobs: Sequence[Job]) -> None:
+    """Raise now what making the files would raise, as far as it can be predicted."""
+    from mipmap_plugin.jobs.run import check
+
+    for job in jobs:
+        check(base, job)
 
 
-def _check(wrapped: Wrapped, files: Sequence[File], settings: dict[str, Any], overwrite: bool) -> None:
-    """Raise now what adapting and saving would raise, as far as it can be predicted."""
-    further = {name: value for name, value in settings.items() if name != "recipe"}
-    for scale, viewer, target in files:
-        config = make_config(settings["recipe"], scale, **further)
-        wrapped.targets(viewer)
-        wrapped.refuse_output(target, overwrite=overwrite, networks_move=config.steps > 0 and config.rates.networks > 0, viewer=viewer)
-
-
-def _made(base: Wrapped, files: Sequence[File], settings: dict[str, Any], page: AdaptationPage | None, overwrite: bool, quiet: bool) -> list[Facts]:
+def _made(base: Wrapped, jobs: Sequence[Job], photographs: Scene | None, page: AdaptationPage | None, quiet: bool) -> list[Facts]:
     """Adapt to each scale and viewer, save the file, draw it for the page, and print a summary unless `quiet`; return all reports."""
     from mipmap_plugin.models.places import state_path
 
-    base.keeps_images, reports = len(files) > 1, list[Facts]()
-    for scale, viewer, target in files:
-        adapted = base.adapt(scale, viewer=viewer, resume=state_path(target), **settings)
+    base.keeps_images, reports = len(jobs) > 1, list[Facts]()
+    for job in jobs:
+        resume = state_path(job.target)
+        adapted = base.adapt(job.scale, recipe=job.recipe, viewer=job.viewer, resume=resume, images=photographs, **job.settings)
         failed: BaseException | None = None
-        with together(target) if page and page.of_one else nullcontext():  # a kill leaves both or none
-            saved = adapted.save(target, overwrite=overwrite)
+        with together(job.target) if page and page.of_one else nullcontext():  # a kill leaves both or none
+            saved = adapted.save(job.target, overwrite=job.overwrite)
             report = adapted.report_of(saved)
             reports.append({"file": str(saved.absolute()), **report.model_dump()})
             try:
                 if page:
-                    page.add(base, adapted.as_written(saved))
+                    with announced("drawing the page"):
+                        page.add(base, adapted.as_written(saved))
                 if page and page.of_one:
                     page.write(reports, ())
             except BaseException as error:  # Ctrl-C too: the file is worth more than its page
@@ -185,37 +182,25 @@ def _requests(scales: Sequence[float], viewers: tuple[str, ...]) -> list[tuple[f
     return [(scale, name) for scale in unique_scales(scales) for name in names]
 
 
-def _most(
-    base: Wrapped,
-    limits: tuple[int | None, str | None],
-    paths: tuple[Path, Path | None],
-    asked: tuple[Sequence[float], tuple[str, ...]],
-    settings: dict[str, Any],
-) -> int | None:
-    """The smaller of a number of splats and of what fits into a size, the `limits`; None if neither is given.
+def _limited(request: Request, base: Wrapped, jobs: Sequence[Job], limits: tuple[int | None, str | None], *, fits: bool) -> Request:
+    """The request with the smaller of a number of splats and of what fits into a size, the `limits`; `fits`: at the scale that so many splats suit.
 
-    `paths`: the checkpoint and the output; `asked`: scales and viewers.
+    `jobs`: those of the request as it is. Raises SettingsError.
     """
-    splats, size = limits
-    if splats is not None and splats < 1:
-        raise SettingsError(f"splats: must be at least 1, got {splats}")
-    if size is None:
-        return splats
-    from mipmap_plugin.levels.fitting import ANY_SCALE, read_size, recorded, splats_within
+    from mipmap_plugin.levels.fitting import ANY_SCALE, fitting_scale, read_size, recorded, splats_within
 
-    most, (scales, viewers) = read_size(size), asked
-    requests = _requests(scales or [ANY_SCALE], viewers)
-    record = recorded(base, requests, settings)
-    targets = [adapted_path(*paths, 1.0, viewer, several=len(requests) > 1) for viewer in viewers or (None,)]  # a viewer may want another format
-    within = min(splats_within(base.model, most, target.name, record) for target in {target.suffix: target for target in targets}.values())
-    return within if splats is None else min(within, splats)
-
-
-def _fitting(model: SplatModel, most: int | None) -> Sequence[float]:
-    """The scale that suits so many splats; none if there is no limit to them."""
-    from mipmap_plugin.levels.fitting import fitting_scale
-
-    return () if most is None else (fitting_scale(most, model),)
+    most, size = limits
+    if most is not None and most < 1:
+        raise SettingsError(f"splats: must be at least 1, got {most}")
+    if size is not None:
+        allowed = read_size(size)
+        record = recorded(base, [(ANY_SCALE if fits else scale, viewer) for scale, viewer in request.targets], request.settings)
+        files = {job.target.suffix: job.target.name for job in jobs}  # a viewer may want another format
+        with announced("trying how large a file is"):
+            most = min([splats_within(base.model, allowed, name, record) for name in files.values()] + ([] if most is None else [most]))
+    assert most is not None
+    targets = [(fitting_scale(most, base.model) if fits else scale, viewer) for scale, viewer in request.targets]
+    return replace(request, targets=targets, settings={**request.settings, "most_splats": most})
 
 
 def _made_for(report: Report, model: SplatModel, saved: Path) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from mipmap_plugin.commands.common import print_json
+from mipmap_plugin.commands.common import print_json, starting
 from mipmap_plugin.commands.list import warn_of_other_groups
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
@@ -21,8 +21,9 @@ def backends(check: str | None = None, full: bool = False, json: bool = False) -
         full: With --check: also run hundreds of random scenes; several minutes.
         json: Print JSON.
     """
-    from mipmap_plugin.backends.conformance import LEAST_RUN, summary
-    from mipmap_plugin.evaluation import backends as tables
+    with starting():
+        from mipmap_plugin.backends.conformance import LEAST_RUN, summary
+        from mipmap_plugin.evaluation import backends as tables
 
     if full and check is None:
         raise SettingsError("--full needs a backend to check; give --check NAME")

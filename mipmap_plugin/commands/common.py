@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,6 +31,13 @@ WORDS: ContextVar[tuple[str, ...]] = ContextVar("WORDS", default=())
 def this_command() -> str:
     """The command as a shell takes it."""
     return typed(["mipmap-plugin", *WORDS.get()])
+
+
+@contextmanager
+def starting() -> Iterator[None]:
+    """Inside, a command imports what it needs: torch takes seconds on a busy machine."""
+    with announced("starting"), uncollected():
+        yield
 
 
 def wrap(base: Base, threads: int | None = None, images: Path | None = None) -> Wrapped:

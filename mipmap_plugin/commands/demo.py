@@ -6,6 +6,7 @@ from pathlib import Path
 
 import tyro
 
+from mipmap_plugin.commands.common import starting
 from mipmap_plugin.commands.types import Scale, Viewer, unique_scales
 from mipmap_plugin.commands.voice import detail, say
 
@@ -26,6 +27,7 @@ def demo(
         report: Also write report.html, a page that shows the zooms, the viewers and the curves.
         overwrite: Replace files that exist there.
     """
-    from mipmap_plugin.demo.run import run_demo
+    with starting():
+        from mipmap_plugin.demo.run import run_demo
 
     say(run_demo(output, unique_scales(scale or (0.125, 0.25, 4.0)), viewer, report=report, overwrite=overwrite, detail=detail))

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from mipmap_plugin.commands.common import print_json, scene, without_none, wrap
+from mipmap_plugin.commands.common import print_json, scene, starting, without_none, wrap
 from mipmap_plugin.commands.pages import evaluation_page_path, look_at, write_evaluation_page
-from mipmap_plugin.commands.resuming import resumable, resume_path
+from mipmap_plugin.commands.resuming import resumable
 from mipmap_plugin.commands.types import BackendName, Background, Scales, ScreenFilter, Seed, Threads, Viewer, unique_scales
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.config import ResizeFilter
@@ -80,7 +80,8 @@ def evaluate(
     with resumable(results.kept, "row"):
         for name, path, folder, own in zip(_names(checkpoint, images), checkpoint, images, cameras or [None] * len(checkpoint), strict=True):
             base = Base(path, own, background, backend, screen_filter)
-            wrapped, photographs = wrap(base, threads, folder), _scene(base, folder, appearance)
+            wrapped, photographs = wrap(base, threads, folder), scene(base, folder)
+            photographs = photographs.numbered_as_upstream() if appearance == "upstream" else photographs
             results.refuse_output([*photographs.images.values()], overwrite)
             results.measure(name, wrapped, photographs, appearance, recipe, settings)
     facts = results.write(checkpoint, overwrite)
@@ -92,8 +93,10 @@ class _Results:
 
     def __init__(self, protocol: str, perceptual: Perceptual | None, scales: list[float], page: Path | None, output: Path | None) -> None:
         self._protocol, self._perceptual, self._scales, self._page, self._output = protocol, perceptual, scales, page, output
+        from mipmap_plugin.models.places import state_path
+
         written = output or page
-        self.kept = resume_path(written) if written else None  # where finished rows are
+        self.kept = state_path(written) if written else None  # the folder of finished rows
         self._rows, self._notes, self._galleries = list[Any](), dict[str, None](), list[Any]()  # notes each once, in their order
         self.judged = list[int]()  # the number of judged views of each checkpoint
         self._scenes = list[Path]()
@@ -173,11 +176,6 @@ def _names(checkpoints: Sequence[Path], images: Sequence[Path]) -> list[str]:
     return [scene if scenes.count(scene) == 1 else f"{scene}, {path}" for scene, path in zip(scenes, checkpoints, strict=True)]
 
 
-def _scene(base: Base, folder: Path, appearance: str) -> Scene:
-    read = scene(base, folder)
-    return read.numbered_as_upstream() if appearance == "upstream" else read
-
-
 def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], cameras: Sequence[Path], outputs: Sequence[Path], overwrite: bool) -> None:
     if not checkpoint:
         raise SettingsError("there is no checkpoint to evaluate; give a PLY or a model folder, or several of them, and --images for each")
@@ -187,7 +185,8 @@ def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], cameras: Sequenc
             raise SettingsError(f"{option}: give {how}; got {len(given)}, for {len(checkpoint)} of these")
     if len(set(outputs)) < len(outputs):
         raise SettingsError(f"{outputs[0]}: the page is written there; give the rows another name, such as {outputs[0].with_suffix('.json')}")
-    from mipmap_plugin.models.outputs import parts_of
+    with starting():
+        from mipmap_plugin.models.outputs import parts_of
 
     read = [part for path in checkpoint for part in (parts_of(None, path) if path.is_dir() else [path])]
     read += [*(file for folder in images for file in folder.glob("transforms*.json")), *cameras]
@@ -198,9 +197,5 @@ def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], cameras: Sequenc
 
 def _title(checkpoint: Sequence[Path], images: Sequence[Path], protocol: str, judged: Sequence[int]) -> str:
     """`judged`: the number of judged views of each checkpoint."""
-    views = plural(judged[0], "view") if len(judged) == 1 else f"{_listed(judged)} views"
-    return f"{_listed(checkpoint)}; truth: {protocol} from {_listed(images)}, real dB over {views}"
-
-
-def _listed(values: Sequence[Any]) -> str:
-    return ", ".join(map(str, values))
+    checkpoints, scenes, views = (", ".join(map(str, values)) for values in (checkpoint, images, judged))
+    return f"{checkpoints}; truth: {protocol} from {scenes}, real dB over {views} view{'' if views == '1' else 's'}"

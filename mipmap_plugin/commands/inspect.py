@@ -15,7 +15,6 @@ from mipmap_plugin.process.garbage import uncollected
 from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
-    from mipmap_plugin.effects import Effect
     from mipmap_plugin.wrap import Wrapped
 
 
@@ -84,6 +83,7 @@ def _facts(checkpoint: Path, wrapped: Wrapped, given: Path | None, *, whole: boo
         gaussians = model.gaussians(wrapped.views()[0].zoomed(_adapted_to(wrapped) or 1.0))
         health = examine(model if holds_splats(model) else VanillaModel.from_gaussians(by_axes(gaussians), model.trained))
         effects = explain(wrapped.effects(), gaussians, effects_of(model))
+        off = sum(not effect.on for effect in effects)
         lost = remarks(wrapped.views(), model, wrapped.effects().near_plane, orbit=not wrapped.cameras)
         told = [*health.sentences(), *lost, *filter(None, [too_unlike(wrapped.views())])]
     return {
@@ -92,7 +92,7 @@ def _facts(checkpoint: Path, wrapped: Wrapped, given: Path | None, *, whole: boo
         "sh degree": f"{gaussians.used_sh_degree()} in use of {gaussians.sh_degree}",
         "trained with": f"{wrapped.trained.told()}, background {_color(wrapped.background)}",
         "cameras": _seen_by(wrapped, given),
-        "effects": [str(effect) for effect in effects if effect.on or whole] + _off(effects, shown=whole),
+        "effects": [str(effect) for effect in effects if effect.on or whole] + ([f"{off} more are off (--all)"] if off and not whole else []),
         "health": told or ["nothing found"],
     }
 
@@ -113,7 +113,7 @@ def _seen_by(wrapped: Wrapped, given: Path | None) -> str:
         return f"{own}, of its base, in {place}" if place else own
     unread, orbit = unread_cameras(wrapped.model.source), wrapped.viewpoints.orbit
     none = f"none are read; {unread} may be of this scene" if unread else "none beside the checkpoint"
-    return f"{none}; it is looked at {orbit.told()}" if orbit.up else none
+    return f"{none}; {f'it is looked at {orbit.told()}' if orbit.up else 'give the scene (--cameras), or say what is up (--up z, for one)'}"
 
 
 def _verdict(wrapped: Wrapped, advice: str, health: Sequence[str], spoilt: bool, unseen: str) -> str:
@@ -152,12 +152,6 @@ def _advice(wrapped: Wrapped, checkpoint: Path, given: Path | None) -> str:
         words += ["--screen-filter", told]
     if given is None and not wrapped.cameras and (up := wrapped.asked.get("up")):
         words += ["--up", up]
-    elif given is not None or not wrapped.cameras:
-        words += ["--cameras", str(given or unread_cameras(wrapped.model.source) or "SCENE")]
+    elif cameras := given or (None if wrapped.cameras else unread_cameras(wrapped.model.source)):
+        words += ["--cameras", str(cameras)]
     return typed(words)
-
-
-def _off(effects: Sequence[Effect], *, shown: bool) -> list[str]:
-    """A line on the effects that are off and not shown."""
-    count = sum(not effect.on for effect in effects)
-    return [] if shown or not count else [f"{count} more are off (--all)"]

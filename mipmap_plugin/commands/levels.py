@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mipmap_plugin.commands.common import without_none, wrap
-from mipmap_plugin.commands.ladders import Exports, print_summary, saved
+from mipmap_plugin.commands.common import starting, without_none, wrap
+from mipmap_plugin.commands.ladder_summary import print_summary
+from mipmap_plugin.commands.ladders import Exports, saved
 from mipmap_plugin.commands.outputs import folder_of_several
 from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, Scale, ScreenFilter, Seed, Threads, Up, Viewer, Way
 from mipmap_plugin.config import ViewPolicy
@@ -61,7 +62,8 @@ def levels(
         overwrite: Replace a ladder that exists.
         json: Print levels.json.
     """
-    from mipmap_plugin.levels.request import LadderRequest
+    with starting():
+        from mipmap_plugin.levels.request import LadderRequest
 
     exports = Exports(streamed_sog, tiles, canvas, named(checkpoint).name if report else None)
     exports.check(folder_of_several(output, (".ply", *WRITTEN, ".json")))

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import tyro
 
-from mipmap_plugin.commands.common import print_facts, print_json
+from mipmap_plugin.commands.common import print_facts, print_json, starting
 from mipmap_plugin.errors import MipmapPluginError, warn
-from mipmap_plugin.process.garbage import uncollected
 
 if TYPE_CHECKING:
     from mipmap_plugin.registry import Registry
@@ -50,7 +49,7 @@ def warn_of_other_groups() -> None:
 
 def _facts(kind: Kind) -> dict[str, Any]:
     """What is known of a kind: names that are built in, and what packages add, with its place and what is wrong with it."""
-    with uncollected():  # some import torch
+    with starting():
         registry, find = registry_of(kind)
     added = {
         name: "; not used, as the name is the same: ".join([f"{first}{_trouble(name, registry, find)}", *others])

@@ -6,20 +6,21 @@ import re
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from os.path import realpath  # of a link to itself too, at which `Path.resolve` fails
 from pathlib import Path
 from typing import Any
 
-from mipmap_plugin.commands.common import print_json
+from mipmap_plugin.commands.common import print_json, starting
 from mipmap_plugin.commands.outputs import adapted_path
-from mipmap_plugin.commands.voice import say
-from mipmap_plugin.errors import JobsFailed, SettingsError, install, plural
+from mipmap_plugin.commands.voice import note, say
+from mipmap_plugin.errors import JobsFailed, SettingsError, install, plural, warn
 from mipmap_plugin.formats.here import from_here
 from mipmap_plugin.formats.staging import missing_folders, remove_empty
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.listing import find_checkpoints, is_pattern, read_list, shard, without_outputs
-from mipmap_plugin.jobs.summary import facts, in_order, table, totals
-from mipmap_plugin.progress import counted, note
+from mipmap_plugin.jobs.summary import facts, in_order, table, totals, warned
+from mipmap_plugin.progress import announced, counted
 
 NO_CHECKPOINT = "there is no checkpoint to adapt; give a PLY or a model folder, several of them, or --list FILE"
 
@@ -70,14 +71,15 @@ def adapt_many(many: Many, given: Sequence[Path], request: Request, base: Base, 
     `given`: checkpoints and patterns; `base`: how each checkpoint is read. Raises SettingsError before any work, JobsFailed and
     KeyboardInterrupt after it.
     """
-    jobs = make_jobs(many, given, request, base)
+    with announced("looking for checkpoints"):
+        jobs = make_jobs(many, given, request, base)
     outcomes: list[Outcome] = []
     missing = {folder for job in jobs for folder in missing_folders(job.target.parent)}
     try:
         with closing(engine(many, jobs, threads)) as running:
             for outcome in counted(running, len(jobs), "adapting", "job"):
                 outcomes.append(outcome)
-                note(str(outcome))
+                note(str(outcome), urgent=outcome.status == "failed")
     except KeyboardInterrupt as interrupt:
         _print(outcomes, jobs, json)
         again = " with --skip-existing" if request.overwrite and not many.skip_existing else ""
@@ -92,15 +94,15 @@ def adapt_many(many: Many, given: Sequence[Path], request: Request, base: Base, 
 def make_jobs(many: Many, given: Sequence[Path], request: Request, base: Base) -> list[Job]:
     """A job for each checkpoint, scale and viewer of this shard. Raises SettingsError if none of them can be right."""
     checkpoints = _checkpoints([*given, *(read_list(many.list) if many.list else [])])
-    several = many.is_list(given) or len(request.targets) > 1
     skip = many.skip_existing or not request.overwrite
-    jobs = [replace(job, skip_finished=skip) for path in checkpoints for job in jobs_of(path, request, base, several=several)]
-    _refuse(jobs)
+    jobs = [replace(job, skip_finished=skip) for path in checkpoints for job in jobs_of(path, request, base, several=many.is_list(given))]
+    refuse(jobs)
     return shard(jobs, *_part(many.shard))
 
 
-def jobs_of(checkpoint: Path, request: Request, base: Base, *, several: bool) -> list[Job]:
-    """The job of one checkpoint for each scale and viewer. `several`: the output is a folder for all."""
+def jobs_of(checkpoint: Path, request: Request, base: Base, *, several: bool = False) -> list[Job]:
+    """The job of one checkpoint for each scale and viewer. The output is a folder for all if there are several, or may be `several` checkpoints."""
+    several = several or len(request.targets) > 1
     own = replace(base, checkpoint=checkpoint.absolute(), cameras=_of_scene(base.cameras, checkpoint))
     settings, images = dict(request.settings), _of_scene(request.images, checkpoint)
     recipe, network, jobs = settings.pop("recipe"), Path(settings.get("upsampler", "")).absolute(), []
@@ -148,18 +150,19 @@ def _of_scene(path: Path | None, checkpoint: Path) -> Path | None:
     return path and Path(str(path).replace("{name}", name)).absolute()
 
 
-def _refuse(jobs: Sequence[Job]) -> None:
+def refuse(jobs: Sequence[Job]) -> None:
     """Raise the errors of settings that are wrong for every checkpoint, and SettingsError for two jobs with one output."""
-    from mipmap_plugin.backends import BACKENDS
-    from mipmap_plugin.splatting.viewers import viewers_for
+    with starting():
+        from mipmap_plugin.backends import BACKENDS
+        from mipmap_plugin.splatting.viewers import viewers_for
 
     if jobs[0].base.backend != "auto":
         BACKENDS.get(jobs[0].base.backend)
     makers: dict[Path, Job] = {}
-    bases = {folder: job.base.checkpoint for job in jobs for folder in (job.base.checkpoint.resolve() / "x").parents}
+    bases = {folder: job.base.checkpoint for job in jobs for folder in Path(realpath(job.base.checkpoint), "x").parents}
     for job in jobs:
         job.config()
-        if job.overwrite and (base := bases.get(job.target.resolve())):
+        if job.overwrite and (base := bases.get(Path(realpath(job.target)), job.base.checkpoint)) != job.base.checkpoint:
             raise SettingsError(f"{from_here(job.target)} holds a checkpoint that is to be adapted too ({from_here(base)}); choose another --output")
         if job.viewer is not None:
             viewers_for(job.viewer)
@@ -204,6 +207,8 @@ def _print(outcomes: Sequence[Outcome], jobs: Sequence[Job], json: bool) -> None
     sorted_outcomes = in_order(outcomes, jobs)
     if json:
         print_json(facts(sorted_outcomes))
-        return
-    say(table(sorted_outcomes))
-    say(totals(outcomes, len(jobs)))
+    else:
+        say(table(sorted_outcomes))
+        say(totals(outcomes, len(jobs)))
+    for text in warned(sorted_outcomes):
+        warn(text)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mipmap_plugin.adaptation.adapted import Adapted
     from mipmap_plugin.evaluation.tradeoff.front import Tradeoff
     from mipmap_plugin.levels.contents import Contents
-    from mipmap_plugin.levels.distance.manifest import Contents as DistanceContents
+    from mipmap_plugin.levels.distance.manifest import DistanceContents
     from mipmap_plugin.pages.gallery import Gallery
     from mipmap_plugin.wrap import Wrapped
 
@@ -95,7 +95,7 @@ def write_tradeoff_page(page: Path, checkpoint: Path, base: Wrapped, overwrite: 
 
 def write_levels_page(folder: Path, ladder: Contents | DistanceContents, title: str) -> Path:
     """Write the page of a ladder into its folder."""
-    from mipmap_plugin.levels.distance.manifest import Contents as DistanceContents
+    from mipmap_plugin.levels.distance.manifest import DistanceContents
     from mipmap_plugin.levels.manifest import read_manifest
     from mipmap_plugin.models.places import PAGE
     from mipmap_plugin.pages.html import write_page

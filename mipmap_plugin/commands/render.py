@@ -15,11 +15,11 @@ import tyro
 from mipmap_plugin.commands.common import base_cameras, wrap
 from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, OwnScale, Up, Viewer
-from mipmap_plugin.commands.voice import say
+from mipmap_plugin.commands.voice import note, say
 from mipmap_plugin.errors import SettingsError, plural, warn
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, settled, sha256, staged, together, write_json
 from mipmap_plugin.jobs.base import Base
-from mipmap_plugin.progress import counted, note
+from mipmap_plugin.progress import counted
 from mipmap_plugin.screen_filters import Name
 
 if TYPE_CHECKING:

@@ -7,17 +7,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from mipmap_plugin.commands.voice import note
 from mipmap_plugin.errors import SettingsError, plural
 from mipmap_plugin.formats.atomic import settled
-from mipmap_plugin.progress import note
 
 # The name of a cell's file, or of the folder in which it is written.
 CELL = re.compile(r"[0-9a-f]{24}\.pt|\.[0-9a-f]{24}\.pt\.\d\.tmp")
-
-
-def resume_path(output: Path) -> Path:
-    """The folder with the finished cells of a command that writes to `output`."""
-    return output.with_name(f"{output.name}.resume")
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mipmap_plugin.commands.common import print_json
+from mipmap_plugin.commands.common import print_json, starting
 from mipmap_plugin.commands.many import Many, Request, engine, finished_before, jobs_of
 from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.errors import SettingsError, plural
@@ -21,15 +21,16 @@ if TYPE_CHECKING:
 
 def adapt_tiled(many: Many, given: Sequence[Path], request: Request, base: Base, threads: int | None, json: bool) -> None:
     """Adapt one checkpoint to each scale and viewer in tiles. Raises SettingsError before any work, JobsFailed."""
-    from mipmap_plugin.tiles.plan import unlock
-    from mipmap_plugin.tiles.run import adapt_all_in_tiles
+    with starting():
+        from mipmap_plugin.tiles.plan import unlock
+        from mipmap_plugin.tiles.run import adapt_all_in_tiles
 
     if many.tiles is None or many.is_list(given) or many.shard is not None:
         raise SettingsError("--tiles cuts one checkpoint; give that one, without --list and --shard")
     if many.send_files:
         raise SettingsError("--tiles needs a folder that all workers see, so that files are not sent; leave --send-files out")
 
-    jobs = jobs_of(given[0], request, base, several=len(request.targets) > 1)
+    jobs = jobs_of(given[0], request, base)
     skip = many.skip_existing or (len(jobs) > 1 and not request.overwrite)  # as in a list
     reports = finished_before(jobs, json, may_load=False) if skip else {}  # the base may not fit into memory
     left = [job for job in jobs if job.target not in reports]

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from mipmap_plugin.commands.common import print_json, scene, without_none, wrap
+from mipmap_plugin.commands.common import print_json, scene, starting, without_none, wrap
 from mipmap_plugin.commands.outputs import folder_of_several
 from mipmap_plugin.commands.pages import look_at, tradeoff_page_path, write_tradeoff_page
 from mipmap_plugin.commands.resuming import resumable
-from mipmap_plugin.commands.types import Background, Cameras, Checkpoint, Scales, ScreenFilter, Up, Viewer, unique_scales
+from mipmap_plugin.commands.types import Background, Cameras, Checkpoint, Scales, ScreenFilter, Threads, Up, Viewer, unique_scales
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.recipes import recipe as make_config
@@ -44,7 +44,7 @@ def tradeoff(
     up: Up = None,
     background: Background = None,
     screen_filter: ScreenFilter = None,
-    threads: int | None = None,
+    threads: Threads = None,
     seed: int = 0,
     picture: bool = True,
     report: bool = False,
@@ -68,18 +68,18 @@ def tradeoff(
         renderers: Also render the first adapted model with other thresholds, tiles and float types, by the reference backend.
         repeats: Number of runs, each with its own seed; the median and the whole range are reported.
         views: Maximum number of views to evaluate on.
-        threads: Maximum number of processor threads; by default as many as torch finds.
         seed: Seed of the first repeat.
         picture: Draw tradeoff.png, which needs the extra plot.
         report: Also write report.html, a page whose fronts tell each point under the pointer.
         overwrite: Replace results that exist.
         json: Print JSON instead of tables.
     """
-    from mipmap_plugin.evaluation.tradeoff.files import KEPT, Folder, refuse
-    from mipmap_plugin.evaluation.tradeoff.points import Plan
-    from mipmap_plugin.evaluation.tradeoff.run import run
-    refuse(folder := Folder(folder_of_several(output, (".json", ".csv", ".png", ".html")), picture, overwrite))
-    page = tradeoff_page_path(output, overwrite) if report else None
+    with starting():
+        from mipmap_plugin.evaluation.tradeoff.files import KEPT
+        from mipmap_plugin.evaluation.tradeoff.points import Plan
+        from mipmap_plugin.evaluation.tradeoff.run import run
+
+    folder, page = _outputs(output, picture, report, overwrite)
     plan = Plan(recipe or ("default", "paper"), steps, backend or ("auto",), supersampling or (2, 4, 8), renderers, repeats, seed, viewer)
     base = Base(checkpoint, cameras, background, screen_filter=screen_filter, up=up)
     model, photographs = wrap(base, threads, images), scene(base, images) if images else None
@@ -87,6 +87,14 @@ def tradeoff(
     with resumable(output / KEPT, "cell"):
         tradeoffs = run(model, photographs, unique_scales(scale), plan, views, _with_page(folder, page, checkpoint, model))
     _print(tradeoffs, folder, page, json)
+
+
+def _outputs(output: Path, picture: bool, report: bool, overwrite: bool) -> tuple[Folder, Path | None]:
+    """The folder for the results, and the page if one is asked for. Raises what writing them would raise."""
+    from mipmap_plugin.evaluation.tradeoff.files import Folder, refuse
+
+    refuse(folder := Folder(folder_of_several(output, (".json", ".csv", ".png", ".html")), picture, overwrite))
+    return folder, tradeoff_page_path(output, overwrite) if report else None
 
 
 def _with_page(folder: Folder, page: Path | None, checkpoint: Path, model: Wrapped) -> Folder:

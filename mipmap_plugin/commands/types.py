@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 
 import tyro
 
+from mipmap_plugin.commands.common import starting
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import MAX_SCALE, MIN_SCALE
 from mipmap_plugin.screen_filters import TrainedName
@@ -30,13 +31,14 @@ def read_scale(text: str) -> float:
 def unique_scales(scales: Sequence[float]) -> list[float]:
     """The scales in their order, without repetitions. Raises SettingsError if there are none."""
     if not scales:
-        raise SettingsError("--scale is required; give --scale 1/4 or --scale 4, for example")
+        raise SettingsError("--scale is required; give --scale 1/4 or --scale 4, for example, or --scale 1 for no zoom")
     return list(dict.fromkeys(scales))
 
 
 def read_viewer(text: str) -> str:
     """The name of a viewer, which people write as its makers do, such as SuperSplat; a name that is not known is left as it is."""
-    from mipmap_plugin.splatting.viewers import NO_RECORD, VIEWERS
+    with starting():
+        from mipmap_plugin.splatting.viewers import NO_RECORD, VIEWERS
 
     names = {*VIEWERS.names(), *NO_RECORD}
     return text if text in names or text.lower() not in names else text.lower()

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from mipmap_plugin.commands.common import base_cameras, wrap
+from mipmap_plugin.commands.common import base_cameras, starting, wrap
 from mipmap_plugin.commands.outputs import adapted_path
-from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, ScreenFilter, Up, Viewer
+from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, ScreenFilter, Threads, Up, Viewer
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import named, refuse_unwritable
@@ -39,7 +39,7 @@ def view(
     background: Background = None,
     screen_filter: ScreenFilter = None,
     backend: BackendName = "auto",
-    threads: int | None = None,
+    threads: Threads = None,
     host: str = "127.0.0.1",
     port: int = 8080,
     browser: bool = True,
@@ -51,13 +51,13 @@ def view(
         adapted: Files adapted from it, and folders of levels, to switch to.
         viewer: Viewer whose drawing is shown first: classic, spark, playcanvas (or supersplat), ... An unknown name lists all viewers.
         output: Folder for what the page's button saves; by default beside the checkpoint. Nothing is overwritten.
-        threads: Maximum number of processor threads; by default as many as torch finds.
         host: Address that the page is served at. Whoever reaches it can use the page; the default is this machine alone.
         port: Port of the page; where it is taken, the next free one.
         browser: Also open the page, where there is a display.
     """
-    from mipmap_plugin.process import threads as all_threads
-    from mipmap_plugin.viewing.page import PageSettings
+    with starting():
+        from mipmap_plugin.process import threads as all_threads
+        from mipmap_plugin.viewing.page import PageSettings
 
     if not 0 <= port <= 65535:
         raise SettingsError(f"port: must be from 0 to 65535, got {port}")

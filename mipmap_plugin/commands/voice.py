@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TextIO, cast
 
+from mipmap_plugin import progress
 from mipmap_plugin.commands.log import Log
 from mipmap_plugin.errors import OutputError, SettingsError
 
@@ -84,8 +85,17 @@ def detail(text: str) -> None:
     VOICE.get().write(text)
 
 
+def note(text: str, *, urgent: bool = False) -> None:
+    """Print a line about work that goes on to standard error, above its bars, unless the command is quiet and it is not `urgent`; also write it to
+    the log."""
+    VOICE.get().write(text)
+    if urgent or not VOICE.get().quiet:
+        with contextlib.suppress(OSError):  # who reads it may have gone
+            progress.note(text)
+
+
 def complain(text: str) -> None:
-    """Print what went wrong on standard error, quiet or not; also write it to the log."""
+    """Print why a command ends on standard error, quiet or not; also write it to the log."""
     VOICE.get().write(text.strip())
     with contextlib.suppress(OSError):  # the exit code says it too
         print(text, file=sys.stderr)

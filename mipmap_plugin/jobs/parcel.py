@@ -78,8 +78,9 @@ def do_parcel(parcel: Parcel, do: Callable[[Job], Outcome]) -> Delivery:
         kept = {"done": (place / OUTPUT).rglob("*"), "interrupted": _states(place / job.target)}.get(outcome.status, [])
         written = [file for file in kept if file.is_file()]
         file = outcome.file and outcome.file.relative_to(place / OUTPUT)
-        reason = outcome.reason.replace(f"{place}{os.sep}", "")
-        return Delivery(replace(outcome, job=job, file=file, reason=reason), _archive({each.relative_to(place / OUTPUT): each for each in written}))
+        reason, *warnings = (text.replace(f"{place}{os.sep}", "") for text in (outcome.reason, *outcome.warnings))
+        told = replace(outcome, job=job, file=file, reason=reason, warnings=tuple(warnings))
+        return Delivery(told, _archive({each.relative_to(place / OUTPUT): each for each in written}))
 
 
 def unpack(delivery: Delivery, job: Job) -> Outcome:

@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import time
 import traceback
+import warnings
 from dataclasses import replace
 
 from mipmap_plugin.adaptation.target.upsamplers import placed
-from mipmap_plugin.errors import MipmapPluginError, OutputExists, of_a_file
+from mipmap_plugin.errors import MipmapPluginError, OutputExists, hide_others_warnings, of_a_file
 from mipmap_plugin.jobs.finished import finished
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.limits import is_out_of_memory
 from mipmap_plugin.models.places import state_path
 from mipmap_plugin.models.zipped_folder import told
+from mipmap_plugin.wrap import Wrapped
 
 
 def run(job: Job, threads: int | None = None) -> Outcome:
-    """Do a job; what is wrong with it becomes its outcome. An interrupted job raises KeyboardInterrupt, and continues when it is run again."""
+    """Do a job; what is wrong with it becomes its outcome, warnings too. Interrupted, it raises KeyboardInterrupt, and goes on when run again."""
     began = time.perf_counter()
-    with placed(job.settings.get("upsampler", ""), job.network):
+    with placed(job.settings.get("upsampler", ""), job.network), warnings.catch_warnings(record=True) as caught:
+        hide_others_warnings()
         outcome = _attempt(job, threads)
-    return replace(outcome, seconds=time.perf_counter() - began)
+    return replace(outcome, seconds=time.perf_counter() - began, warnings=tuple(told(each.message) for each in caught))
 
 
 def _attempt(job: Job, threads: int | None) -> Outcome:
@@ -47,11 +50,16 @@ def _finished_before(job: Job) -> Outcome | None:
 def _adapt(job: Job, threads: int | None) -> Outcome:
     base = job.base.load(threads, job.images)
     base.keeps_images = False
-    config = job.config()
-    base.targets(job.viewer)
-    networks_move = config.steps > 0 and config.rates.networks > 0
-    base.refuse_output(job.target, overwrite=job.overwrite, networks_move=networks_move, viewer=job.viewer)
+    check(base, job)
     scene = None if job.images is None else job.base.photographs(job.images)
     adapted = base.adapt(job.scale, recipe=job.recipe, viewer=job.viewer, resume=state_path(job.target), images=scene, **job.settings)
     file = adapted.save(job.target, overwrite=job.overwrite)
     return Outcome(job, "done", file, adapted.report_of(file).model_dump())
+
+
+def check(base: Wrapped, job: Job) -> None:
+    """Raise now what adapting a loaded base and saving the result would raise, as far as it can be predicted."""
+    config = job.config()
+    base.targets(job.viewer)
+    networks_move = config.steps > 0 and config.rates.networks > 0
+    base.refuse_output(job.target, overwrite=job.overwrite, networks_move=networks_move, viewer=job.viewer)

@@ -12,13 +12,11 @@ import queue
 import signal
 import sys
 import threading
-import warnings
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr
-from dataclasses import replace
 from typing import IO
 
-from mipmap_plugin.errors import MipmapPluginWarning
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.process.freed_memory import keep_freed_memory
 from mipmap_plugin.process.signals import INTERRUPTED, Ending, ends_as_by_ctrl_c
@@ -63,19 +61,16 @@ def _leave(number: int, frame: object) -> None:
 
 
 def _run_quietly(job: Job, threads: int | None) -> Outcome:
-    """Do a job without its progress bars, which would mix with those of other workers; its warnings are part of its outcome."""
-    with redirect_stderr(io.StringIO()), warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("ignore")
-        warnings.filterwarnings("default", module=r"mipmap_plugin(\.|$)")
-        warnings.filterwarnings("default", category=MipmapPluginWarning)
+    """Do a job without its progress bars, which would mix with those of other workers."""
+    began = time.perf_counter()
+    with redirect_stderr(io.StringIO()):
         try:
             from mipmap_plugin.jobs.run import run  # not interruptible: what it loads, torch among it, may swallow a KeyboardInterrupt
 
             with _interruptible():
-                outcome = run(job, threads)
+                return run(job, threads)
         except KeyboardInterrupt as interrupt:
-            outcome = Outcome(job, "interrupted", reason=str(interrupt) or "interrupted")
-    return replace(outcome, warnings=tuple(str(each.message) for each in caught))
+            return Outcome(job, "interrupted", reason=str(interrupt) or "interrupted", seconds=time.perf_counter() - began)
 
 
 @contextmanager

@@ -52,6 +52,15 @@ def totals(outcomes: Sequence[Outcome], count: int) -> str:
     return f"{plural(count, 'job')}: {', '.join(parts) or 'none begun'}"
 
 
+def warned(outcomes: Iterable[Outcome]) -> list[str]:
+    """What jobs warned of, each warning once, behind the jobs that gave it."""
+    jobs = dict[str, list[str]]()
+    for outcome in outcomes:
+        for text in outcome.warnings:
+            jobs.setdefault(text, []).append(str(outcome.job))
+    return [f"{', '.join(of)}: {text}" for text, of in jobs.items()]
+
+
 def facts(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
     """Each job and its outcome, for JSON; of one that succeeded also its report."""
     return [

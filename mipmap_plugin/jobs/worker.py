@@ -93,7 +93,7 @@ def do(job: Job, worker: Worker) -> Outcome:
         try:
             worker.begin(sent)
             outcome = worker.outcome()
-            return replace(outcome, job=job, reason=told(outcome.reason))
+            return replace(outcome, job=job, reason=told(outcome.reason), warnings=tuple(map(told, outcome.warnings)))
         except WorkerDied as death:
             deaths += 1
             if worker.stopped:

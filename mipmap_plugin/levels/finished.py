@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.errors import plural
 from mipmap_plugin.formats.atomic import delete, together
 from mipmap_plugin.levels.contents import Contents, Level
-from mipmap_plugin.levels.distance.manifest import Contents as DistanceContents
+from mipmap_plugin.levels.distance.manifest import DistanceContents
+from mipmap_plugin.levels.manifest import refuse_ladder, write_levels
 from mipmap_plugin.levels.store import LevelStore
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.process.torch_modes import in_usual_modes
@@ -23,7 +25,7 @@ class Ladder:
 
     contents: Contents | DistanceContents
     _store: LevelStore
-    _write: Callable[[Any, Path, bool], Path]  # contents, folder, whether to overwrite
+    _manifest: Callable[[Any, list[Path]], dict[str, Any]]  # of the contents, whose levels are in these files
 
     def __repr__(self) -> str:
         return f"<Ladder: {plural(len(self.levels), 'level')}>"
@@ -41,7 +43,9 @@ class Ladder:
         """
         folder = path_of(folder)
         with together(folder, [] if keep_resume else self._store.folders()):
-            saved = self._write(self.contents, folder, overwrite)
+            refuse_ladder(folder, self.contents.base, overwrite=overwrite)
+            adapted = [level.adapted if isinstance(level, Level) else level for level in self.levels]
+            saved = write_levels(adapted, partial(self._manifest, self.contents), folder, overwrite)
             if keep_resume:
                 self._store.note(saved)
         return saved

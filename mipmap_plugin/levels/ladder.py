@@ -19,7 +19,7 @@ from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.contents import Contents, CurvePoint, LeftOut, Level, Switch
 from mipmap_plugin.levels.distance.ladder import by_distance, make_levels_by_distance
 from mipmap_plugin.levels.finished import Ladder
-from mipmap_plugin.levels.manifest import write_ladder
+from mipmap_plugin.levels.manifest import manifest
 from mipmap_plugin.levels.request import FINEST_RATIO, MOST_LOST, SAME, Band, LadderRequest
 from mipmap_plugin.levels.store import LevelStore
 from mipmap_plugin.levels.switching import EVEN, switching_zoom, zooms_between
@@ -72,7 +72,7 @@ def _make_levels_by_zoom(base: FrozenBase, request: LadderRequest, resume: Path 
         edges = [1.0, *(switch.zoom for switch in switches), end]
         curve = _curve(levels, edges, yardstick, lambda zoom: yardstick.psnr_of_base(base, request.viewer, zoom))
     left_out = sorted([*unused, *unshown], key=lambda level: -level.scale)
-    return Ladder(Contents(request, base, levels, switches, curve, left_out), store, write_ladder)
+    return Ladder(Contents(request, base, levels, switches, curve, left_out), store, manifest)
 
 
 @dataclass(frozen=True, eq=False)

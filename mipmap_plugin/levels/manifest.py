@@ -28,11 +28,6 @@ CANVAS = 1080
 WRITTEN = (MANIFEST, "level_*.ply", f"level_*.ply{REPORT}", "report.html", "streamed/*", "tiles/*")
 
 
-def level_name(number: int) -> str:
-    """The file of a level; 0 is the finest, as in other tools."""
-    return f"level_{number}.ply"
-
-
 def refuse_ladder(folder: Path, base: FrozenBase, *, overwrite: bool, room: int = 0) -> None:
     """Raise what writing a ladder to `folder` would raise. A folder with other things in it is never replaced. Raises OutputExists, OutputError.
 
@@ -44,19 +39,11 @@ def refuse_ladder(folder: Path, base: FrozenBase, *, overwrite: bool, room: int 
     refuse_unwritable(folder, room, what="the levels take about", why=", with what is kept of them until all are done")
 
 
-def write_ladder(ladder: Contents, folder: Path, overwrite: bool) -> Path:
-    """`write_levels` of a ladder by zoom."""
-    refuse_ladder(folder, ladder.base, overwrite=overwrite)
-    return write_levels([level.adapted for level in ladder.levels], lambda files: manifest(ladder, files), folder, overwrite)
-
-
 def write_levels(levels: Sequence[Adapted], manifest_of: Callable[[list[Path]], dict[str, Any]], folder: Path, overwrite: bool) -> Path:
-    """Write the levels, a report beside each, and the manifest; the folder appears complete or not at all. Raises OutputExists, OutputError.
-
-    `manifest_of`: makes the manifest of the levels' files.
-    """
+    """Write the levels, a report beside each, and the manifest of their files; the folder appears complete or not at all. Raises OutputExists,
+    OutputError."""
     with new_folder(folder, overwrite) as temporary:
-        files = [level.save(temporary / level_name(number)) for number, level in enumerate(levels)]
+        files = [level.save(temporary / f"level_{number}.ply") for number, level in enumerate(levels)]  # 0 is the finest, as in other tools
         write_json(temporary / MANIFEST, manifest_of(files), overwrite=False)
     return folder
 

@@ -38,12 +38,12 @@ class Yardstick:
         generator = torch.Generator().manual_seed(derived_seed(seed, DRAW))
         views = jittered(with_company(base.views(), base.viewpoints.orbit), TRIED * VIEWS, generator, spread=False)
         shown = showing(views, base.model.parameters()["means"], base.effects().near_plane)  # between objects far apart there is nothing
-        self._views = [view.window(WINDOW, WINDOW) for view in (shown or views)[:VIEWS]]
-        self._images = {view: base.render(view).image.clamp(0, 1) for view in self._views}
+        self.views = [view.window(WINDOW, WINDOW) for view in (shown or views)[:VIEWS]]
+        self._images = {view: base.render(view).image.clamp(0, 1) for view in self.views}
 
     def example(self) -> tuple[Camera, Tensor]:
         """One of the views, and the base's own image of it [h, w, 3]."""
-        view = self._views[0]
+        view = self.views[0]
         return view, self._images[view]
 
     def psnr(self, level: Adapted, zoom: float) -> float:
@@ -59,7 +59,7 @@ class Yardstick:
         return self._mean(lambda camera, _: psnr_as_shown(one.render(camera).image, other.render(camera).image), zoom)
 
     def _mean(self, compare: Callable[[Camera, Tensor], float], zoom: float) -> float:
-        cameras = {view: view.zoomed(zoom) for view in self._views}
+        cameras = {view: view.zoomed(zoom) for view in self.views}
         return fmean(compare(camera, shrunk(self._images[view], camera)) for view, camera in cameras.items())
 
 

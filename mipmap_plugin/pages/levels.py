@@ -13,7 +13,7 @@ from mipmap_plugin.errors import plural
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.formats.here import size_in_bytes
 from mipmap_plugin.levels.contents import Contents
-from mipmap_plugin.levels.yardstick import VIEWS, Yardstick, shrunk
+from mipmap_plugin.levels.yardstick import Yardstick, shrunk
 from mipmap_plugin.pages.gallery import effects_of_base
 from mipmap_plugin.pages.record import Page, Picture, Role, Zoom, zoom_name
 
@@ -47,7 +47,7 @@ def _zoom(ladder: Contents, yardstick: Yardstick, scale: float) -> Zoom:
         adapted = ladder.levels[number].adapted
         pictures.append(_picture(name, role, adapted.render(camera).image, truth, yardstick.psnr(adapted, scale), f"level_{number}.ply"))
     pictures.insert(2, Picture("base, supersampled", "truth", truth, note=TRUTH))
-    return Zoom(rounded(scale), scale, pictures, view.name, TRUTH, f"{VIEWS} views that no level was adapted to")
+    return Zoom(rounded(scale), scale, pictures, view.name, TRUTH, f"{plural(len(yardstick.views), 'view')} that no level was adapted to")
 
 
 def _shown(ladder: Contents, scale: float) -> list[tuple[str, Role, int]]:

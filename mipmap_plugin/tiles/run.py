@@ -221,6 +221,8 @@ def _done(jobs: Sequence[Job], engine: Engine, what: str) -> list[Outcome]:
     try:
         for outcome in counted(running, len(jobs), f"tiles: {what}", "job"):
             outcomes.append(outcome)
+            for text in outcome.warnings:
+                warn(text)
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt("interrupted; run the same command again to go on where it stopped") from interrupt
     finally:

@@ -44,6 +44,22 @@ def test_adapt_two_scales_into_a_folder(run, model_folder, tmp_path):
     assert not list(tmp_path.rglob("*.resume"))
 
 
+@pytest.mark.parametrize("words", ["", "--scale 1/2 --recipe mine", "--scale 1/2 --steps -1", "--scale 1/2 --viewer nobody", "--splats 9 --steps -1"])
+def test_what_is_wrong_whatever_the_checkpoint_is_said_before_it_is_read(run, model_folder, monkeypatch, words):
+    """Reading a large one takes long."""
+    monkeypatch.setattr("mipmap_plugin.commands.adapt.wrap", lambda *_: pytest.fail("it was read"))
+    refused(run("adapt", model_folder, *words.split()))
+
+
+def test_a_folder_that_is_given_for_a_file_is_not_offered_to_be_replaced(run, model_folder, tmp_path):
+    base = tiny.ply(tmp_path / "base.ply")
+    said = f"{tmp_path} is a folder; give the path of what is to be written, such as {tmp_path / 'base_x0.5.ply'}"
+    assert "--overwrite" not in refused(run("adapt", base, "--scale", "1/2", "--output", tmp_path), said)
+    words = ["adapt", model_folder, "--scale", "1/2", "--output", tmp_path / "made", *NO_STEP]
+    assert run(*words)[0] == 0
+    refused(run(*words), "made exists already; pass --overwrite")
+
+
 def test_a_file_that_is_written_takes_no_memory_while_the_next_is_made(run, model_folder, tmp_path, monkeypatch):
     made, left, adapt = [], [], Wrapped.adapt
 

@@ -8,7 +8,7 @@ import anchor_checkpoints
 import numpy as np
 import pytest
 import tiny
-from commands_run import refused
+from commands_run import NO_STEP, refused
 
 from mipmap_plugin.backends import BACKENDS
 from mipmap_plugin.backends.cpu import CpuBackend
@@ -18,6 +18,9 @@ from mipmap_plugin.models import load_model
 from mipmap_plugin.scenes import write_cameras
 
 pytestmark = pytest.mark.usefixtures("few_views")
+
+# What can be given of a file without cameras.
+WITHOUT = "give the scene (--cameras), or say what is up (--up z, for one)"
 
 
 def test_inspect_says_what_a_checkpoint_is(run, model_folder):
@@ -96,8 +99,15 @@ def test_inspect_as_json(run, tmp_path):
     code, out, _ = run("inspect", tiny.ply(tmp_path / "a.ply"), "--json")
     facts = json.loads(out)
     assert code == 0
-    assert (facts["family"], facts["splats"], facts["cameras"]) == ("3dgs", 60, "none beside the checkpoint")
+    assert (facts["family"], facts["splats"], facts["cameras"]) == ("3dgs", 60, f"none beside the checkpoint; {WITHOUT}")
     assert isinstance(facts["effects"], list) and isinstance(facts["notes"], list)
+
+
+def test_the_next_command_for_a_lone_file_can_be_run_as_it_is(run, tmp_path):
+    """It ended with --cameras SCENE, and there is no such file."""
+    ply = tiny.ply(tmp_path / "a.ply")
+    [words] = re.findall("next: mipmap-plugin (.+)", run("inspect", ply, "--no-viewers")[1])
+    assert run(*words.split(), *NO_STEP)[0] == 0
 
 
 def test_cameras_beside_a_lone_file_are_named_but_not_read(run, tmp_path):
@@ -105,7 +115,7 @@ def test_cameras_beside_a_lone_file_are_named_but_not_read(run, tmp_path):
     ply, cameras = tiny.ply(tmp_path / "a.ply"), tmp_path / "cameras.json"
     cameras.write_text("[]")
     out = run("inspect", ply, "--no-viewers")[1]
-    assert f"cameras:      none are read; {cameras} may be of this scene\n" in out
+    assert f"cameras:      none are read; {cameras} may be of this scene; {WITHOUT}\n" in out
     assert f"adapt {ply} --scale 1/4 --cameras {cameras}\n" in out
     err = run("adapt", ply, "--scale", "1/2", "--recipe", "instant")[2]
     assert f"give the scene's cameras (--cameras), such as {cameras}, if it is of this scene" in " ".join(err.split())

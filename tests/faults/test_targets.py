@@ -172,7 +172,7 @@ def test_the_working_folder_is_a_folder_like_others(tmp_path, refused, monkeypat
     monkeypatch.chdir(tmp_path)
     assert "holds the base checkpoint itself" in refused("adapt", base, "--scale", "1/2", "--output", output, "--overwrite", *INSTANT)
     monkeypatch.chdir(tmp_path / "here")
-    assert "pass --overwrite" in refused("adapt", base, "--scale", "1/2", "--output", output, *INSTANT)
+    assert "give the path of what is to be written, such as base_x0.5.ply" in refused("adapt", base, "--scale", "1/2", "--output", output, *INSTANT)
 
 
 def test_other_commands_spare_the_checkpoint_too(tmp_path, refused):

@@ -3,6 +3,7 @@
 import json
 import os
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import tiny
@@ -39,6 +40,36 @@ def test_what_a_job_failed_by_is_told_by_its_path_from_here(run, tmp_path, monke
     assert str(tmp_path) not in out + err
 
 
+@pytest.mark.parametrize("jobs", [[], ["--jobs", "2"]], ids=["in this process", "in workers"])
+def test_what_jobs_warn_of_is_told_of_each(run, tmp_path, monkeypatch, jobs):
+    """It was lost in workers, and in this process told of the first of them alone, without its name."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.ply", "b.ply"):
+        tiny.ply(tmp_path / name)
+    words = ["adapt", "a.ply", "b.ply", "--scale", "1/2", "--recipe", "instant", *jobs]
+    code, _, err = run(*words)
+    assert code == 0 and "mipmap-plugin: a.ply x0.5, b.ply x0.5: no cameras are known: " in err and err.count("no cameras") == 1
+    told = json.loads(run(*words, "--overwrite", "--json")[1])
+    assert all("no cameras are known" in each["warnings"][0] for each in told)
+
+
+def test_a_quiet_batch_tells_what_failed_and_its_log_tells_all(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tiny.folder(tmp_path / "a", tiny.cameras(3))
+    _, out, err = run("adapt", "a", "nowhere.ply", "--scale", "1/2", "--quiet", "--log", "log", *NO_STEP)
+    assert out == "" and "nowhere.ply x0.5: failed, nowhere.ply does not exist" in err and "a x0.5: done" not in err
+    log = (tmp_path / "log").read_text()
+    assert log.index("a x0.5: done") < log.index("2 jobs: 1 done, 1 failed")
+
+
+def test_a_job_that_is_interrupted_in_this_process_is_in_the_table(run, scenes, monkeypatch):
+    """It was said not to have begun."""
+    monkeypatch.setattr(Wrapped, "adapt", Mock(side_effect=KeyboardInterrupt("interrupted at step 7")))
+    code, out, err = run("adapt", scenes / "chair", scenes / "lego", "--scale", "1/2")
+    assert code == 130 and "chair x0.5: interrupted at step 7" in err
+    assert "  interrupted at step 7\n" in out and out.endswith("2 jobs: 1 interrupted, 1 not begun\n")
+
+
 def test_jobs_that_fail_side_by_side_leave_no_empty_folder(run, scenes, tmp_path, monkeypatch):
     """Each of them removes what it made, but not what the other one had made before."""
 
@@ -58,6 +89,13 @@ def test_no_job_replaces_the_base_of_another(run, tmp_path):
     code, _, err = run("adapt", tmp_path / "a.ply", tmp_path / "a_x0.5.ply", "--scale", "1/2", "--overwrite", *NO_STEP)
     assert code == 2 and "a_x0.5.ply holds a checkpoint that is to be adapted too" in err
     assert (tmp_path / "a_x0.5.ply").read_bytes() == before
+
+
+@pytest.mark.parametrize("more", [[], ["--jobs", "1"], ["--overwrite"]], ids=" ".join)
+def test_a_link_to_itself_is_no_checkpoint(run, tmp_path, more):
+    (tmp_path / "loop.ply").symlink_to("loop.ply")
+    code, out, err = run("adapt", tmp_path / "loop.ply", "--scale", "1/2", *more)
+    assert code == 2 and "loop.ply" in err and "Traceback" not in out + err
 
 
 def test_this_folder_is_a_checkpoint_too(run, scenes, monkeypatch):

@@ -120,6 +120,7 @@ def test_ctrl_c_saves_the_state_of_every_running_job(run, scenes, tmp_path, engi
     assert process.returncode == 130, err
     assert "mipmap-plugin: interrupted; run the same command again to go on where it stopped" in err and "Traceback" not in err
     assert out.strip().endswith("4 jobs: 4 interrupted" if "--dask" in engine else "4 jobs: 2 interrupted, 2 not begun")
+    assert "--dask" in engine or "  0.0  " not in out  # the seconds of a job that was broken off
     assert len(list(scenes.glob("*.resume"))) == 2 and not list(scenes.glob(".*.lock"))
 
 

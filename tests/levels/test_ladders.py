@@ -13,11 +13,11 @@ from brief_levels import BRIEF, request, wrapped
 
 from mipmap_plugin import cli, load_model, wrap_model
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report
-from mipmap_plugin.commands.ladders import print_summary
+from mipmap_plugin.commands.ladder_summary import print_summary
 from mipmap_plugin.errors import OutputExists, SettingsError
-from mipmap_plugin.levels.contents import Contents, LeftOut, Level
+from mipmap_plugin.levels.contents import LeftOut, Level
 from mipmap_plugin.levels.ladder import NO_FEWER, NOT_BETTER, UNSHOWN, _no_use, _shown, _Work, make_levels
-from mipmap_plugin.levels.manifest import MANIFEST, base_pixel, write_ladder
+from mipmap_plugin.levels.manifest import MANIFEST, base_pixel, refuse_ladder
 from mipmap_plugin.levels.request import MERGING_COSTS, Band
 from mipmap_plugin.models.places import state_path
 from mipmap_plugin.models.vanilla import VanillaModel
@@ -129,10 +129,10 @@ def test_a_saved_ladder_says_what_it_is(tmp_path):
     assert manifest["worst_db"] == min(point["psnr_db"] for point in manifest["curve"]) and manifest["viewer"] == "antialiased"
     assert [point["zoom"] for point in manifest["curve"]] == sorted((point["zoom"] for point in manifest["curve"]), reverse=True)
     with pytest.raises(OutputExists, match="exists already"):
-        write_ladder(Contents(request(), base, [], [], []), saved, overwrite=False)
+        refuse_ladder(saved, base, overwrite=False)
     (saved / "notes.txt").write_text("mine")
     with pytest.raises(OutputExists, match=r"has other things in it, such as notes.txt"):
-        write_ladder(Contents(request(), base, [], [], []), saved, overwrite=True)
+        refuse_ladder(saved, base, overwrite=True)
 
 
 def test_splats_in_no_picture_have_no_part_in_the_size_of_a_pixel():
@@ -191,6 +191,15 @@ def test_what_no_viewer_draws_has_no_levels(tmp_path, write, by):
     base = wrap_model(tmp_path / "base", cameras=tiny.cameras(2))
     with pytest.raises(SettingsError, match="levels are files for viewers, so adapt it to one scale at a time"):
         make_levels(base, request("supersplat", by=by))
+
+
+def test_no_level_advises_to_leave_out_the_viewer_that_a_ladder_needs(monkeypatch, recwarn):
+    monkeypatch.setattr("mipmap_plugin.adaptation.session.psnr_as_trained", lambda *_: 99.0)
+    advice = "adapt without a viewer"
+    wrapped().adapt(1 / 2, viewer="antialiased", **BRIEF)
+    assert advice in str(recwarn.pop(UserWarning).message)
+    ladder = make_levels(wrapped(), request(coarsest=1 / 2))
+    assert not any(advice in str(each.message) for each in recwarn) and advice not in str([level.adapted.report.notes for level in ladder.levels])
 
 
 def test_the_command_does_not_advise_to_leave_out_the_viewer_that_it_needs(tmp_path, capsys):

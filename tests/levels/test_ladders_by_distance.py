@@ -198,7 +198,8 @@ def test_a_ladder_that_ends_within_its_first_band_has_one_level(tmp_path, capsys
     assert (tmp_path / "out" / "report.html").is_file()
 
 
-def test_the_page_of_walks_has_the_figures_of_their_manifest(tmp_path, capsys, command):
+def test_the_page_of_walks_has_the_figures_of_their_manifest(tmp_path, capsys, monkeypatch, command):
+    monkeypatch.setattr("mipmap_plugin.levels.distance.yardstick.VIEWS", 1)  # as where only one sees something
     assert cli.main([*command, "--coarsest", "1/4", "--report"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == f"page: {tmp_path / 'out' / 'report.html'}"
     record, manifest = record_of(tmp_path / "out" / "report.html"), json.loads((tmp_path / "out" / MANIFEST).read_text())
@@ -207,6 +208,7 @@ def test_the_page_of_walks_has_the_figures_of_their_manifest(tmp_path, capsys, c
     assert scales == sorted(scales) and scales[-1] == 1 and scales[0] < 1 / 2 and len(scales) > 3
     curve = {round(point["psnr_db"], 6): point for point in manifest["curve"]}
     for zoom in record["zooms"]:
+        assert zoom["mean_of"] == "1 walk that no level was adapted to"
         base, levels, truth = zoom["pictures"]
         assert [base["role"], levels["role"], truth["role"]] == ["base", "adapted", "truth"]
         assert curve[round(levels["mean"]["psnr_db"], 6)]["base_db"] == pytest.approx(base["mean"]["psnr_db"])

@@ -14,7 +14,7 @@ from exchange_files import answer_by
 from two_levels import CHUNKS, LADDER
 
 from mipmap_plugin import cli
-from mipmap_plugin.commands.ladders import _below
+from mipmap_plugin.commands.ladder_summary import _below
 from mipmap_plugin.errors import OutputError, OutputExists, SettingsError
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.streamed_sog import read_chunks
@@ -221,7 +221,7 @@ def test_a_ladder_that_came_out_as_one_level_is_kept_for_a_command_that_does_not
     assert cli.main(words) == 0 and (tmp_path / "ladder" / "level_0.ply").is_file()
 
 
-@pytest.mark.parametrize("at", ["mipmap_plugin.levels.ladder.write_ladder", "mipmap_plugin.levels.store.LevelStore._loaded"])
+@pytest.mark.parametrize("at", ["mipmap_plugin.levels.finished.write_levels", "mipmap_plugin.levels.store.LevelStore._loaded"])
 def test_a_disk_that_fills_leaves_the_finished_levels_for_the_same_command(tmp_path, capsys, monkeypatch, at):
     words = made_of_two_levels(tmp_path, "--steps", "1")
     with monkeypatch.context() as first:

@@ -219,7 +219,8 @@ def test_the_page_of_a_tradeoff_has_the_points_of_its_json(model_folder, tmp_pat
     assert main(words) == 2
 
 
-def test_the_page_of_levels_has_the_figures_of_their_manifest(model_folder, tmp_path, capsys):
+def test_the_page_of_levels_has_the_figures_of_their_manifest(model_folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.levels.yardstick.VIEWS", 1)  # as where only one shows something
     words = ["levels", model_folder, "--viewer", "antialiased", "--coarsest", "1/2", "--ratio", "2", "--report", *BRIEF]
     assert main([str(word) for word in (*words, "--output", tmp_path / "ladder")]) == 0
     page = tmp_path / "ladder" / "report.html"
@@ -230,6 +231,7 @@ def test_the_page_of_levels_has_the_figures_of_their_manifest(model_folder, tmp_
     assert [zoom["scale"] for zoom in record["zooms"]] == pytest.approx(sorted({0.5, round(switch["zoom"], 9), 1.0}))
     means = {point["zoom"]: point for point in manifest["curve"]}
     for zoom in record["zooms"]:
+        assert zoom["mean_of"] == "1 view that no level was adapted to"
         pictures = {picture["name"]: picture for picture in zoom["pictures"]}
         assert ("next level" in pictures) == (zoom["scale"] == switch["zoom"])
         assert [picture["role"] for picture in zoom["pictures"]][:3] == ["base", "adapted", "truth"]

@@ -11,6 +11,8 @@ import tiny
 from running import wait_until
 
 from mipmap_plugin import progress
+from mipmap_plugin.cli import _our_warnings_only
+from mipmap_plugin.errors import warn
 from mipmap_plugin.wrap import wrap_model
 
 pytestmark = pytest.mark.usefixtures("few_views")
@@ -30,6 +32,21 @@ def test_long_work_is_announced_on_a_terminal_alone(terminal, patience, line, mo
     with progress.announced("merging x0.25"):
         time.sleep(0.2 if patience < 1 else 0)
     assert line in errors.getvalue() and bool(errors.getvalue()) == bool(line)
+
+
+def test_short_work_one_after_the_other_is_announced_when_together_it_takes_long(monkeypatch):
+    """A run has a dozen phases, on a slow machine each of nearly a second."""
+    monkeypatch.setattr(sys, "stderr", errors := Terminal())
+    monkeypatch.setattr(progress, "PATIENCE", 3600)
+    monkeypatch.setattr(progress, "PERIOD", 60)
+    monkeypatch.setattr(progress, "_silent_since", time.monotonic() - 3600)
+    monkeypatch.setattr(progress, "_ended_at", time.monotonic() - 1)
+    with progress.announced("merging"):
+        wait_until(lambda: "merging: " in errors.getvalue())
+    shown = errors.getvalue()
+    with progress.announced("writing"):
+        pass
+    assert errors.getvalue() == shown
 
 
 class Log:
@@ -76,6 +93,15 @@ def test_the_clock_of_a_bar_goes_on_while_nothing_is_counted(monkeypatch):
     with progress.Bar(total=2) as bar, progress.ticking(bar):
         time.sleep(0.05)
     assert not silent.getvalue()
+
+
+def test_a_warning_has_a_line_of_its_own_above_a_bar(monkeypatch):
+    """It was appended to what the bar showed."""
+    monkeypatch.setattr(sys, "stderr", errors := Terminal())
+    with progress.Bar(total=2, desc="adapting"), _our_warnings_only():
+        errors_before = errors.getvalue()
+        warn("mind this")
+    assert "adapting" in errors_before and "\rmipmap-plugin: mind this\n" in errors.getvalue()
 
 
 def test_a_terminal_that_knows_no_size_shows_bars(monkeypatch):

@@ -183,11 +183,6 @@ def test_torch_keeps_to_one_thread_and_gets_its_own_back():
         assert torch.get_num_threads() == threads.for_kernels() == 3 and threads.for_views() == 1
 
 
-def test_no_threads_are_refused():
-    with pytest.raises(SettingsError, match="at least 1, got 0"), threads.limited(0, shared=True):
-        pass
-
-
 def test_what_ends_one_thread_lets_the_others_begin_nothing_more():
     main, begun = threading.current_thread(), []
 
@@ -206,6 +201,8 @@ def test_what_ends_one_thread_lets_the_others_begin_nothing_more():
 def test_numbers_of_threads_that_are_none_are_refused(wrong):
     with pytest.raises(SettingsError, match="threads must be at least 1"):
         threads.limit_torch(wrong)
+    with pytest.raises(SettingsError, match="threads must be at least 1"), threads.limited(wrong, shared=True):
+        pass
 
 
 def test_what_a_command_measures_has_the_threads_that_were_asked_for(tmp_path):

@@ -15,7 +15,7 @@ from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.contents import LeftOut
 from mipmap_plugin.levels.distance.chunks import LEAST_OF_BASE, Chunks
 from mipmap_plugin.levels.distance.level import AS_FINER, LevelRun
-from mipmap_plugin.levels.distance.manifest import Contents, write
+from mipmap_plugin.levels.distance.manifest import DistanceContents, manifest
 from mipmap_plugin.levels.distance.rule import DistanceRule, is_unbounded, nearest
 from mipmap_plugin.levels.distance.scene import Scene
 from mipmap_plugin.levels.distance.walks import focal_of, foreground
@@ -54,7 +54,7 @@ def make_levels_by_distance(base: FrozenBase, request: LadderRequest, resume: Pa
         scene, levels, left_out = without_repeats(scene, levels)
         with announced("measuring the levels"):
             curve = measured(scene, [level.model for level in levels])
-    return Ladder(Contents(scene, levels, curve, left_out), store, write)
+    return Ladder(DistanceContents(scene, levels, curve, left_out), store, manifest)
 
 
 def without_repeats(scene: Scene, levels: list[Adapted]) -> tuple[Scene, list[Adapted], list[LeftOut]]:

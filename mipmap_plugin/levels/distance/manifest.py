@@ -9,14 +9,15 @@ from statistics import fmean
 from typing import Any
 
 from mipmap_plugin.adaptation.adapted import Adapted
+from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.contents import LeftOut
 from mipmap_plugin.levels.distance.scene import Scene
 from mipmap_plugin.levels.distance.yardstick import TRUTH, WalkPoint
-from mipmap_plugin.levels.manifest import CANVAS, FORMAT, file_facts, refuse_ladder, write_levels
+from mipmap_plugin.levels.manifest import CANVAS, FORMAT, file_facts
 
 
 @dataclass(frozen=True, eq=False)
-class Contents:
+class DistanceContents:
     """Levels from the finest to the coarsest, and how good they are on walks."""
 
     scene: Scene
@@ -24,14 +25,12 @@ class Contents:
     curve: list[WalkPoint]
     left_out: Sequence[LeftOut]  # beyond the last level, by falling scale
 
-
-def write(ladder: Contents, folder: Path, overwrite: bool) -> Path:
-    """`write_levels` of a ladder by distance."""
-    refuse_ladder(folder, ladder.scene.base, overwrite=overwrite)
-    return write_levels(ladder.levels, lambda files: manifest(ladder, files), folder, overwrite)
+    @property
+    def base(self) -> FrozenBase:
+        return self.scene.base
 
 
-def manifest(ladder: Contents, files: list[Path]) -> dict[str, Any]:
+def manifest(ladder: DistanceContents, files: list[Path]) -> dict[str, Any]:
     """The manifest of a ladder whose levels are in `files`."""
     scene, first = ladder.scene, ladder.levels[0].report
     switches = [scene.rule.ends(number)[1] for number in range(scene.rule.count - 1)]
@@ -57,7 +56,7 @@ def manifest(ladder: Contents, files: list[Path]) -> dict[str, Any]:
     }
 
 
-def _entry(ladder: Contents, number: int, file: Path) -> dict[str, Any]:
+def _entry(ladder: DistanceContents, number: int, file: Path) -> dict[str, Any]:
     """One level, and the distances on the canvas between which it is shown; null: no limit."""
     level, rule = ladder.levels[number], ladder.scene.rule
     low, high = rule.ends(number)

@@ -26,7 +26,7 @@ from mipmap_plugin.scenes.trajectories import jittered, with_company
 SAMPLES = 3
 
 TRUTH = (
-    f"mean PSNR over {VIEWS} random walks backwards that no level was adapted to, levels chosen by chunk, against the base with "
+    f"mean PSNR over at most {VIEWS} random walks backwards that no level was adapted to, levels chosen by chunk, against the base with "
     f"{SAMPLES} x {SAMPLES} samples a pixel, its dilation as large in the world as where the walk begins"
 )
 
