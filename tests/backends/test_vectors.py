@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 from exchange_files import RECORD
-from test_reference import BACKEND, t2_camera, t3_gaussian
+from samples import t2_camera, t3_gaussian
 
+from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.formats.magic import SPLAT_RECORD, kind_of
 from mipmap_plugin.gaussians import Gaussians
@@ -58,7 +59,7 @@ def test_t6_fainter_splats_are_not_drawn(difference, drawn):
     splat, view = _with_opacity(torch.sigmoid(torch.tensor(MIN_LOGIT + difference, dtype=torch.float64))), t2_camera()
     x, y = project(splat, view, 0.2).means2d[0].tolist()
     on_a_pixel = replace(view, cx=view.cx + 37.5 - x, cy=view.cy + 21.5 - y)
-    assert bool(BACKEND.render(splat, on_a_pixel, Effects(0)).alpha.any()) == drawn
+    assert bool(ReferenceBackend().render(splat, on_a_pixel, Effects(0)).alpha.any()) == drawn
 
 
 def _with_opacity(opacity) -> Gaussians:
