@@ -68,15 +68,17 @@ def test_the_layers_of_a_view_are_not_all_in_memory_at_once(halved):
     assert max(most) <= 2
 
 
-def test_a_change_of_the_core_shows_as_far_as_the_halo_lets_it_through(halved):
+@pytest.mark.parametrize("changed", ["sh", "opacities"])
+def test_a_change_of_the_core_shows_as_far_as_the_halo_lets_it_through(halved, changed):
     """Close to what the whole shows: only where splats overlap across a cut do layers differ from it."""
     splats, view, rows, around = whole_and_tiles(halved)
     for own, halo in zip(rows, around, strict=True):
         crop = halo.crop(view)
-        brighter = splats.sh.clone()
-        brighter[own, 0] += 0.5
-        change = shown_in(halved, replace(splats, sh=brighter), view, crop) - shown_in(halved, splats, view, crop)
-        seen = halo.render(replace(splats, sh=brighter)[own], crop) - halo.render(splats[own], crop)
+        values = getattr(splats, changed).clone()
+        values[own] = values[own] + 0.5 if changed == "sh" else values[own] / 2
+        other = replace(splats, **{changed: values})
+        change = shown_in(halved, other, view, crop) - shown_in(halved, splats, view, crop)
+        seen = halo.render(other[own], crop) - halo.render(splats[own], crop)
         assert (seen - change).abs().mean() < 0.2 * change.abs().mean()
 
 
