@@ -8,7 +8,7 @@ import pytest
 import torch
 from largest import Largest
 
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import Camera, viewmat_of
 from mipmap_plugin.effects import NEAR_PLANE
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.scenes import jittered, load_scene, orbit
@@ -179,6 +179,31 @@ def test_parallel_cameras_have_views_on_the_line_through_both_and_a_little_beyon
     assert torch.equal(centers[:, 1:], torch.zeros(50, 2, dtype=torch.float64))
     assert centers[:, 0].min() >= -2 * BEYOND and centers[:, 0].max() <= 2 + 2 * BEYOND
     assert centers[:, 0].min() < 0 < 2 < centers[:, 0].max()
+
+
+def standing(turn: float, *eye: float) -> Camera:
+    """A camera at a place that is turned about y by an angle."""
+    return replace(straight(), viewmat=viewmat_of(straight(turn=turn).viewmat[:3, :3].T, torch.tensor(eye, dtype=torch.float64)))
+
+
+def test_cameras_whose_sights_meet_behind_one_of_them_have_views_on_the_line_through_both():
+    """As those of one who walks on and turns: an arc around that point would be a detour."""
+    views = jittered([standing(0.0, 0.0, 0.0, 0.0), standing(-0.5, 1.0, 0.0, 3.0)], 20, seeded(), amount=0.0)
+    centers = torch.stack([view.center for view in views])
+    torch.testing.assert_close(centers, centers[:, :1] * torch.tensor([1.0, 0.0, 3.0], dtype=torch.float64))
+
+
+def test_between_a_near_camera_and_a_far_one_views_are_neither_near_nor_far():
+    views = jittered([standing(0.0, 0.0, 0.0, -1.0), standing(0.5, 4 * math.sin(0.5), 0.0, -4 * math.cos(0.5))], 20, seeded(), amount=0.0)
+    assert 5 <= sum(1.2 < view.center.norm() < 3.5 for view in views) < 20
+
+
+def test_views_are_turned_by_a_part_of_their_own_field_of_view():
+    wide, narrow = straight(), replace(straight(), fx=800.0, fy=800.0)
+    turns = {8.0: [], 800.0: []}
+    for view in jittered([wide, narrow], 40, seeded(), spread=False):
+        turns[view.fx].append(rotation_vector(view.viewmat[:3, :3]).norm().item())
+    assert min(turns[8.0]) > max(turns[800.0]) > 0
 
 
 def test_cameras_around_something_have_views_as_far_from_it_as_they_are():
