@@ -138,6 +138,15 @@ def test_moments_share_the_means_that_they_were_evaluated_at():
     assert len({place.data_ptr() for place, _ in known._known.values()}) == 2
 
 
+def test_splats_that_moved_in_place_are_evaluated_anew():
+    """As an optimizer moves them."""
+    known, _ = counted_memory()
+    means = torch.ones(10, 3)
+    for _ in range(3):  # as the base's, and as others
+        assert torch.equal(known(means, 0.5)["means"], means / 2)
+        means += 1
+
+
 def test_many_splats_are_evaluated_in_parts(monkeypatch):
     monkeypatch.setattr(memory, "CHUNK", 4)
     known, asked = counted_memory()
@@ -180,6 +189,11 @@ def test_other_rows_are_evaluated_anew(tmp_path):
     student.follow(reach=0.1)
     student.replace_parameters({name: tensor.detach()[:7].clone().requires_grad_() for name, tensor in student.parameters().items()})
     assert len(student.gaussians(moving.at(0.2))) == 7
+
+
+def test_a_slope_is_that_of_places_at_the_distance():
+    known, _ = counted_memory()  # which moves splats by 0, 1/4, ... 1 of their places
+    assert known.slope(torch.ones(10, 3), 0.3) == pytest.approx((1.875 / 5) ** 0.5)
 
 
 def test_the_reach_is_shorter_where_neighbors_move_otherwise(tmp_path):

@@ -22,7 +22,7 @@ from mipmap_plugin.tiles.pictures import Album, new_pictures
 from mipmap_plugin.tiles.run import adapt_in_tiles
 from mipmap_plugin.tiles.steering import Steered, open_state
 from mipmap_plugin.tiles.store import Store
-from mipmap_plugin.tiles.surroundings import Surroundings, nothing
+from mipmap_plugin.tiles.surroundings import KEPT, Surroundings, nothing
 from mipmap_plugin.tiles.tile import Tile
 from mipmap_plugin.tiles.truth import Truths
 
@@ -68,6 +68,12 @@ def test_the_layers_of_a_view_are_not_all_in_memory_at_once(halved):
     layers = [Counted([layer_file(halved.folder, number, sweep.halos)]) for number in range(3)]
     assert len(list(_halos(halved, halved.sweep_views(sweep)[0], layers))) == 3
     assert max(most) <= 2
+
+
+def test_the_surroundings_of_many_views_are_not_all_in_memory_at_once(halved, monkeypatch):
+    around = Surroundings(halved, 0, halved.sweeps[0])
+    monkeypatch.setattr(around, "_read", lambda name: name)
+    assert [around._surrounding(str(number)) for number in range(2 * KEPT)][-1] in around._kept and len(around._kept) == KEPT
 
 
 @pytest.mark.parametrize("changed", ["sh", "opacities"])

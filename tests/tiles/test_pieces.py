@@ -9,6 +9,7 @@ import tiny
 import torch
 
 from mipmap_plugin.adaptation.start.blend_weights import weighed
+from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import CheckpointError
@@ -150,9 +151,12 @@ def test_slabs_give_the_picture_of_all_splats(on_disk, monkeypatch):
     assert torch.allclose(1 - Painter(backend, EFFECTS).draw(splats, camera).transmittance[..., 0], whole.alpha, atol=2e-4)
 
 
-def test_slabs_give_the_blend_weights_of_all_splats(on_disk, monkeypatch):
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_slabs_give_the_blend_weights_of_all_splats(on_disk, monkeypatch, backend):
+    if backend == "cpu":
+        pytest.importorskip("numba")
     splats, in_memory = on_disk
-    views, backend = tiny.cameras(3), ReferenceBackend()
+    views, backend = tiny.cameras(3), get_backend(backend)
     monkeypatch.setattr(slabs, "COLORLESS_SLAB", 37)
     expected, shown = weighed(in_memory, views, backend, EFFECTS)
     found = Painter(backend, EFFECTS).weighed(splats, views)
