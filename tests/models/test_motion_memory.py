@@ -173,6 +173,17 @@ def test_a_followed_model_moves_its_splats_as_before_until_they_are_far_off(tmp_
     assert torch.equal(student.gaussians(camera).means, moving.moved_to(model.field, student.canonical, 0.7).means)
 
 
+def test_more_than_a_tenth_of_the_splats_have_to_move_far(tmp_path):
+    student = load_model(moving.write_deformable(tmp_path / "m")).copy()
+    student.follow(reach=0.1)
+    before = student.held.clone()
+    for far, followed in ((6, False), (7, True)):  # of 60
+        with torch.no_grad():
+            student.parameters()["means"][:far] += 1
+        student.follow(reach=0.1)
+        assert torch.equal(student.held, before) != followed
+
+
 def test_rows_that_are_left_move_as_before_without_an_evaluation(tmp_path, monkeypatch):
     model = load_model(moving.write_deformable(tmp_path / "m"))
     student, camera, rows = model.copy(), moving.at(0.2), torch.arange(0, 60, 3)
