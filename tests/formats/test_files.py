@@ -110,6 +110,16 @@ def test_what_is_written_together_appears_together(tmp_path):
     assert (tmp_path / "a").read_text() == "new" and not (tmp_path / "c").exists()
 
 
+def test_an_output_appears_after_its_companions(tmp_path, monkeypatch):
+    """Whoever finds it finds them, whatever their names."""
+    moved, replace = [], os.replace
+    monkeypatch.setattr(os, "replace", lambda made, target: (moved.append(target.name), replace(made, target)))
+    with together(tmp_path / "b"):
+        for name in "bac":
+            text(tmp_path / name)
+    assert moved[-1] == "b" and sorted(moved) == ["a", "b", "c"]
+
+
 def test_a_file_can_be_added_to_a_folder_that_is_being_made(tmp_path):
     folder_of(tmp_path / "a", "old")
     with together(tmp_path / "a"):

@@ -117,7 +117,9 @@ def test_splats_beside_a_picture_are_seen_as_far_as_they_reach():
     assert rows.tolist() == [0, 1, 2, 3] and depths.tolist() == [10.0] * 4
 
 
-def test_splats_come_back_from_a_file_as_they_were(tmp_path):
+@pytest.mark.parametrize("piece", [7, 50])
+def test_splats_come_back_from_a_file_as_they_were(tmp_path, monkeypatch, piece):
+    monkeypatch.setattr("mipmap_plugin.tiles.store.PIECE", piece)
     model = tiny.model(50, degree=2)
     for name, read in stored(tmp_path / "a.splats", model).parameters().items():
         assert torch.equal(read, model.parameters()[name])
