@@ -10,7 +10,7 @@ import torch
 from oracle import brute_force
 from torch_checkpoints import Hostile, activated, aim, equal, gsplat_folder, normalized_by_numpy, splatfacto_folder, splats
 
-from mipmap_plugin.errors import CheckpointError, OutputExists, SceneError
+from mipmap_plugin.errors import CheckpointError, SceneError
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import provenance_of
@@ -154,15 +154,6 @@ def test_a_ply_is_written_on_request(tmp_path):
     raw = splats()
     saved = load_model(gsplat_folder(tmp_path / "r", raw)).save(tmp_path / "out.ply", provenance={})
     assert np.array_equal(read_ply(saved).columns["scale_1"], raw["scales"][:, 1].numpy())
-
-
-def test_nothing_is_lost_by_saving(tmp_path):
-    model = load_model(gsplat_folder(tmp_path / "r", splats()))
-    for target in ("r", "r/ckpts/ckpt_6999_rank0.pt"):
-        with pytest.raises(OutputExists):
-            model.save(tmp_path / target, provenance={})
-    with pytest.raises(OutputExists, match="the base checkpoint itself"):
-        model.save(tmp_path / "r", provenance={}, overwrite=True)
 
 
 @pytest.mark.parametrize(
