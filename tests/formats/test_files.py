@@ -146,6 +146,23 @@ def test_folders_are_replaced_whole(tmp_path, monkeypatch, exchanges):
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
+def test_a_folder_that_cannot_be_moved_into_place_leaves_the_old_one(tmp_path, monkeypatch):
+    """On a system that cannot exchange folders, where the old one is moved aside before."""
+    folder_of(tmp_path / "a", "old")
+    rename = os.rename
+
+    def refused(made, target):
+        if made.parent.name == "ready":
+            raise PermissionError(13, "Permission denied")
+        rename(made, target)
+
+    monkeypatch.setattr(staging, "exchange", lambda one, other: False)
+    monkeypatch.setattr(os, "rename", refused)
+    with pytest.raises(OutputError, match="a cannot be written"):
+        folder_of(tmp_path / "a", "new")
+    assert (tmp_path / "a/inside/a").read_text() == "old" and [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
 def test_what_dead_runs_left_is_put_right_by_whoever_comes_next(tmp_path):
     dead, ready = tmp_path / ".a.0.tmp", tmp_path / ".a.3.tmp"
     (dead / "new/a").mkdir(parents=True)

@@ -10,6 +10,7 @@ import tiny
 import torch
 from cut_scenes import config, cut_in_three
 
+from mipmap_plugin.adaptation.optimization.validation import TIE_DB
 from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS
 from mipmap_plugin.adaptation.schedule import ViewSchedule
 from mipmap_plugin.jobs.base import Base
@@ -136,12 +137,12 @@ def measured(halved, monkeypatch):
 
 @pytest.mark.parametrize(
     ("psnrs", "kept", "ceiling"),
-    [((31.0, 32.0), 2, 1.0), ((31.0, 30.95), 2, 1.0), ((31.0, 30.0), 1, 0.5), ((29.0,), 0, 0.5)],
+    [((31.0, 32.0), 2, 1.0), ((31.0, 30.95), 2, 1.0), ((31.0, 30.0), 1, 0.5), ((29.0,), 0, 0.5), ((31.0, 31.0 - TIE_DB / 2, 29.0), 2, 0.5)],
 )
 def test_what_does_harm_to_the_whole_is_undone(halved, measured, monkeypatch, psnrs, kept, ceiling):
     measured(*psnrs)
     monkeypatch.setattr(steering, "rate_factor", lambda *_: 1.0)
-    steering.steer(halved, Sweep(0, 0, (1, 2), 0, 0))
+    steering.steer(halved, Sweep(0, 0, tuple(range(1, max(2, len(psnrs)) + 1)), 0, 0))
     after = Steered.before(halved.folder, 1)
     assert (max(after.step, 0), after.ceiling, tuple(after.psnrs)) == (kept, ceiling, psnrs)
 
