@@ -204,9 +204,11 @@ def test_what_a_living_run_makes_is_let_alone(tmp_path):
 
 
 def test_more_runs_than_there_is_room_for_end_in_one_sentence(tmp_path):
+    opened = len(os.listdir("/dev/fd"))
     living = [staging.Staging(tmp_path / "a") for _ in range(staging.SLOTS)]
     with pytest.raises(OutputError, match="a cannot be written: 8 other runs are writing to it"):
         text(tmp_path / "a")
+    assert len(os.listdir("/dev/fd")) == opened + len(living)
     for handle in living:
         handle.close()
     text(tmp_path / "a")
