@@ -149,12 +149,15 @@ def test_what_does_harm_to_the_whole_is_undone(halved, measured, monkeypatch, ps
 
 
 def test_a_little_loss_in_the_warm_up_is_no_harm_and_it_is_not_repeated(halved, measured, monkeypatch):
-    measured(32.0, 31.0, 29.0)
-    monkeypatch.setattr(halved, "config", halved.config.model_copy(update={"warm_up": 1.0}))
+    measured(32.0, 31.0, 29.0, 29.0)
+    monkeypatch.setattr(halved, "config", halved.config.model_copy(update={"warm_up": 0.75}))
     steering.steer(halved, Sweep(0, 0, (1, 2, 3), 0, 0))
     after = Steered.before(halved.folder, 1)
     assert (after.step, after.ceiling < 1) == (1, True)
     assert after.following is None or not after.following.repeats
+    steering.steer(halved, Sweep(1, 3, (4,), 1, 1))
+    again = Steered.before(halved.folder, 2).following
+    assert (again.first, again.checks, again.repeats) == (3, (4,), 1)  # none of the warm-up's steps
 
 
 def test_what_did_harm_is_done_again_in_front_of_the_same_halos_but_not_for_ever(halved, measured, monkeypatch):
