@@ -84,6 +84,8 @@ def test_what_is_in_the_picture_but_not_seen_is_weighed_in_more_views(job):
     search = StartSearch(cut_in_three(replace(job, base=Base(folder))))
     search.run()
     assert len(search.views) == 2 * LEAST_VIEWS
+    whole, _ = search.scene.painter(search.scene.base_effects).weighed(search.scene.base, search.views)
+    torch.testing.assert_close(search._measured(), whole * search.scene.scale**2)
 
 
 def test_without_a_closed_form_merged_splats_keep_their_opacities(job, monkeypatch):
