@@ -37,6 +37,7 @@ def test_t3_view_conic_and_alpha():
 def test_t3_color():
     splat, view = t3_gaussian(), t2_camera()
     assert colors(splat.sh, splat.means, view.center, 0)[0].tolist() == pytest.approx([0.641047396, 0.415371562, 0.528209479], abs=1e-9)
+    assert colors(splat.sh - 2, splat.means, view.center, 0)[0, 1:].tolist() == [0.0, 0.0]
 
 
 def test_t5_record_of_a_splat_file(tmp_path):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import anchor_checkpoints
 import numpy as np
@@ -12,13 +14,14 @@ import torch
 from cut_scenes import cut_in_three, report, rewritten
 
 from mipmap_plugin.cli import main
-from mipmap_plugin.errors import BackendUnavailable, CheckpointError, SettingsError
+from mipmap_plugin.errors import BackendUnavailable, CheckpointError, OutputError, SettingsError
 from mipmap_plugin.formats.magic import SPLAT_RECORD
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.health import ACTIVATED
 from mipmap_plugin.tiles.folder import work_folder
+from mipmap_plugin.tiles.plan import refuse
 from mipmap_plugin.tiles.reading import find_splats, make_cut
 from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
 from mipmap_plugin.tiles.scene import opened
@@ -88,6 +91,15 @@ def test_requests_that_no_tiles_serve(job, changes, tiles, reason):
     with pytest.raises(SettingsError, match=reason):
         adapt_in_tiles(replace(job, **changes), tiles)
     assert not work_folder(job.target).exists()
+
+
+def test_the_cut_needs_room_for_the_base_twice_and_for_once_where_it_is_cut(job, monkeypatch):
+    size = next(job.base.checkpoint.rglob("*.ply")).stat().st_size
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=size * 3 // 2))
+    with pytest.raises(OutputError, match=f"and the tiles take at least {2 * size:,}"):
+        refuse(job, 2)
+    cut_in_three(job)
+    refuse(job, 3)
 
 
 def test_files_of_the_web_are_converted_before_they_are_cut(tmp_path):
