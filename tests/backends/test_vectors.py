@@ -37,7 +37,9 @@ def test_t3_view_conic_and_alpha():
 def test_t3_color():
     splat, view = t3_gaussian(), t2_camera()
     assert colors(splat.sh, splat.means, view.center, 0)[0].tolist() == pytest.approx([0.641047396, 0.415371562, 0.528209479], abs=1e-9)
-    assert colors(splat.sh - 2, splat.means, view.center, 0)[0, 1:].tolist() == [0.0, 0.0]
+    for degree in (0, 1):
+        dark = torch.cat([splat.sh - 2, splat.sh.new_zeros(1, (degree + 1) ** 2 - 1, 3)], dim=1)
+        assert colors(dark, splat.means, view.center, degree)[0, 1:].tolist() == [0.0, 0.0]
 
 
 def test_t5_record_of_a_splat_file(tmp_path):

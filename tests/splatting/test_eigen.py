@@ -3,7 +3,9 @@
 import pytest
 import torch
 
-from mipmap_plugin.splatting.eigen import eigh3
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.eigen import by_axes, eigh3
+from mipmap_plugin.splatting.projection import covariances_of
 from mipmap_plugin.splatting.rotations import rotations
 
 
@@ -47,3 +49,9 @@ def test_it_equals_torchs(name):
     assert (values.diff(dim=1) >= 0).all()
     assert ((vectors @ torch.diag_embed(values) @ vectors.mT - matrices).abs() <= 2 * rounding).all()
     torch.testing.assert_close(vectors.mT @ vectors, torch.eye(3, dtype=torch.float64).expand_as(vectors), atol=4e-15, rtol=0)
+
+
+def test_splats_of_any_covariances_have_axes_and_no_reflections():
+    covariances = MATRICES["ordinary"][:50]
+    splats = Gaussians(torch.zeros(50, 3), torch.ones(50, 4), torch.ones(50, 3), torch.ones(50), torch.zeros(50, 1, 3), covariances.float())
+    torch.testing.assert_close(covariances_of(by_axes(splats)).double(), covariances, atol=1e-5, rtol=0)
