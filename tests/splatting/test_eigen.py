@@ -6,7 +6,7 @@ import torch
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.eigen import by_axes, eigh3
 from mipmap_plugin.splatting.projection import covariances_of
-from mipmap_plugin.splatting.rotations import rotations
+from mipmap_plugin.splatting.rotations import quaternions, rotations
 
 
 def turned(variances: torch.Tensor, seed: int = 0) -> torch.Tensor:
@@ -49,6 +49,13 @@ def test_it_equals_torchs(name):
     assert (values.diff(dim=1) >= 0).all()
     assert ((vectors @ torch.diag_embed(values) @ vectors.mT - matrices).abs() <= 2 * rounding).all()
     torch.testing.assert_close(vectors.mT @ vectors, torch.eye(3, dtype=torch.float64).expand_as(vectors), atol=4e-15, rtol=0)
+
+
+def test_quaternions_of_rotations_are_those_that_made_them():
+    """Whichever of their numbers is the largest."""
+    quats = torch.nn.functional.normalize(torch.cat([torch.eye(4), torch.randn(50, 4, generator=torch.Generator().manual_seed(0))]).double())
+    found = quaternions(rotations(quats))
+    torch.testing.assert_close(found * (found * quats).sum(1, keepdim=True).sign(), quats)
 
 
 def test_splats_of_any_covariances_have_axes_and_no_reflections():
