@@ -51,7 +51,7 @@ def half_turned(path: Path) -> None:
     """Turn the splats of a 3DGS PLY by half a turn about x, which is exact: only signs change, those of y and z among them."""
     ply = read_ply(path)
     rest = sum(name.startswith("f_rest_") for name in ply.columns)
-    negated = {"y", "z", "ny", "nz", "rot_2", "rot_3"}  # the quaternion also turns about the splat's own x, which does not change its shape
+    negated = {"y", "z", "rot_2", "rot_3"}  # the quaternion also turns about the splat's own x, which does not change its shape
     negated |= {f"f_rest_{i}" for i in range(rest) if _is_odd(i % (rest // 3) + 1)}
     columns = {name: -column if name in negated else column for name, column in ply.columns.items()}
     write_ply(path, columns, ply.comments, overwrite=True)

@@ -65,7 +65,7 @@ class Surroundings:
             return None
         left, top, right, bottom = self._halos.box(name)
         target = view.zoomed(self._scene.scale)
-        return replace(target, width=right - left, height=bottom - top, cx=target.cx - left, cy=target.cy - top, zoom=1.0)
+        return replace(target, width=right - left, height=bottom - top, cx=target.cx - left, cy=target.cy - top)
 
     def _surrounding(self, name: str) -> _Surrounding:
         with self._lock:

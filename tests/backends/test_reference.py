@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from oracle import brute_force
-from samples import camera, gaussians, leaves
+from samples import camera, gaussians, leaves, t2_camera, t3_gaussian
 
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.backends.supersample import render
@@ -115,17 +115,6 @@ def test_where_nothing_is_drawn_any_parameter_alone_has_a_gradient_of_zero(alone
     tensors[alone].requires_grad_()
     rendered = BACKEND.render(Gaussians(*tensors), camera(), Effects(1))
     assert not torch.autograd.grad(rendered.image.sum() + rendered.alpha.sum(), tensors[alone])[0].any()
-
-
-def t2_camera() -> Camera:
-    rows = [[0.726315789, -0.610526316, -0.315789474, 0.5], [0.526315789, 0.789473684, -0.315789474, -0.25],
-            [0.442105263, 0.063157895, 0.894736842, 4.0], [0, 0, 0, 1]]  # fmt: skip
-    return Camera(64, 48, 70.0, 72.0, 32.0, 24.0, torch.tensor(rows, dtype=torch.float64))
-
-
-def t3_gaussian() -> Gaussians:
-    t = lambda *x: torch.tensor([x], dtype=torch.float64)  # noqa: E731
-    return Gaussians(t(0.1, 0.2, 0.3), t(1, 0.5, -0.5, 0.25), t(0.2, 0.1, 0.05), torch.sigmoid(t(1.0))[0], t(0.5, -0.3, 0.1)[:, None])
 
 
 def test_t3_projection():

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 from exchange_files import RECORD
-from test_reference import BACKEND, t2_camera, t3_gaussian
+from samples import t2_camera, t3_gaussian
 
+from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.formats.magic import SPLAT_RECORD, kind_of
 from mipmap_plugin.gaussians import Gaussians
@@ -36,6 +37,9 @@ def test_t3_view_conic_and_alpha():
 def test_t3_color():
     splat, view = t3_gaussian(), t2_camera()
     assert colors(splat.sh, splat.means, view.center, 0)[0].tolist() == pytest.approx([0.641047396, 0.415371562, 0.528209479], abs=1e-9)
+    for degree in (0, 1):
+        dark = torch.cat([splat.sh - 2, splat.sh.new_zeros(1, (degree + 1) ** 2 - 1, 3)], dim=1)
+        assert colors(dark, splat.means, view.center, degree)[0, 1:].tolist() == [0.0, 0.0]
 
 
 def test_t5_record_of_a_splat_file(tmp_path):
@@ -58,7 +62,7 @@ def test_t6_fainter_splats_are_not_drawn(difference, drawn):
     splat, view = _with_opacity(torch.sigmoid(torch.tensor(MIN_LOGIT + difference, dtype=torch.float64))), t2_camera()
     x, y = project(splat, view, 0.2).means2d[0].tolist()
     on_a_pixel = replace(view, cx=view.cx + 37.5 - x, cy=view.cy + 21.5 - y)
-    assert bool(BACKEND.render(splat, on_a_pixel, Effects(0)).alpha.any()) == drawn
+    assert bool(ReferenceBackend().render(splat, on_a_pixel, Effects(0)).alpha.any()) == drawn
 
 
 def _with_opacity(opacity) -> Gaussians:

@@ -39,6 +39,9 @@ PATIENCE = 60_000
 # World units between which a viewer's depth buffer lies; nothing of the pictures depends on it.
 NEAR, FAR = 0.01, 1000.0
 
+# dB of two pictures that differ by rounding.
+ALIKE = 45.0
+
 # Our name of a viewer's convention: its page, and the settings that are not its defaults.
 VIEWERS: dict[str, tuple[str, dict[str, Any]]] = {
     "spark": ("spark", {}),
@@ -151,6 +154,14 @@ class Page:
         text = _told(self._viewer, self._shown, "view => viewer.draw(view)", view | size)
         pixels = np.frombuffer(base64.b64decode(text), np.uint8).reshape(camera.height, camera.width, 4)
         return pixels[::-1, :, :3].astype(np.float32) / 255
+
+
+def psnr(image: np.ndarray, other: np.ndarray) -> float:
+    return float(-10 * np.log10(max(np.square(image - other).mean(), 1e-12)))
+
+
+def at(cameras: Sequence[Camera], scale: float) -> list[Camera]:
+    return [camera.zoomed(scale) for camera in cameras]
 
 
 def projection(camera: Camera) -> np.ndarray:

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from browser import Browser, missing
+from browser import ALIKE, Browser, at, missing, psnr
 from in_viser import drawn, in_viser
-from test_real_viewers import ALIKE, at, psnr
 
 from mipmap_plugin import Camera, wrap_model
 from mipmap_plugin.demo.run import embedded

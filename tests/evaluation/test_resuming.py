@@ -17,6 +17,7 @@ from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.cli import main
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import OutputError
+from mipmap_plugin.evaluation import cells
 from mipmap_plugin.evaluation.cells import Cells, made_by
 from mipmap_plugin.evaluation.evaluate import _adapted_rows, training_free_rows
 from mipmap_plugin.evaluation.measure import adapt_alone
@@ -173,11 +174,14 @@ def test_a_finished_command_is_not_replaced(folder):
     assert main(tradeoff(folder, "new")) == 2
 
 
-def test_a_cell_is_found_by_all_that_it_depends_on(tmp_path):
+def test_a_cell_is_found_by_all_that_it_depends_on(tmp_path, monkeypatch):
     Cells(tmp_path, {"base": "a"}).keep({"row": "base", "scale": 0.5}, {"psnr": 1.0})
     assert Cells(tmp_path, {"base": "a"}).find({"scale": 0.5, "row": "base"}) == {"psnr": 1.0}
     assert Cells(tmp_path, {"base": "b"}).find({"row": "base", "scale": 0.5}) is None
     assert Cells(tmp_path, {"base": "a"}).find({"row": "base", "scale": 0.25}) is None
+    with monkeypatch.context() as patched:
+        patched.setattr(cells, "versions", lambda: {"mipmap_plugin": "another"})
+        assert Cells(tmp_path, {"base": "a"}).find({"row": "base", "scale": 0.5}) is None
     [file] = tmp_path.iterdir()
     file.write_bytes(file.read_bytes()[:-9])
     assert Cells(tmp_path, {"base": "a"}).find({"row": "base", "scale": 0.5}) is None

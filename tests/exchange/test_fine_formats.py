@@ -238,6 +238,7 @@ def test_an_spz_has_its_harmonics_in_8_bits(tmp_path):
     columns["f_rest_4"][3], columns["f_rest_5"][4] = 2.0, -2.0  # which are cut off
     (tmp_path / "a.spz").write_bytes(spz_of(columns, 2))
     refine(tmp_path / "a.spz", columns)
+    assert (tmp_path / "a.spz").read_bytes()[4:8] == bytes(4)  # no date: the same splats have the same bytes
     written = gzip.decompress((tmp_path / "a.spz").read_bytes())
     assert written[16 + 9 * 20 : -20 * 24] == bytes(range(11)) * 20
     rest = (np.frombuffer(written[-20 * 24 :], np.uint8).reshape(20, 8, 3).astype(float) - 128) / 128

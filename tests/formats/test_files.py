@@ -110,6 +110,16 @@ def test_what_is_written_together_appears_together(tmp_path):
     assert (tmp_path / "a").read_text() == "new" and not (tmp_path / "c").exists()
 
 
+def test_an_output_appears_after_its_companions(tmp_path, monkeypatch):
+    """Whoever finds it finds them, whatever their names."""
+    moved, replace = [], os.replace
+    monkeypatch.setattr(os, "replace", lambda made, target: (moved.append(target.name), replace(made, target)))
+    with together(tmp_path / "b"):
+        for name in "bac":
+            text(tmp_path / name)
+    assert moved[-1] == "b" and sorted(moved) == ["a", "b", "c"]
+
+
 def test_a_file_can_be_added_to_a_folder_that_is_being_made(tmp_path):
     folder_of(tmp_path / "a", "old")
     with together(tmp_path / "a"):
@@ -134,6 +144,23 @@ def test_folders_are_replaced_whole(tmp_path, monkeypatch, exchanges):
         folder_of(tmp_path / "a", content)
         assert (tmp_path / "a/inside/a").read_text() == content
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_a_folder_that_cannot_be_moved_into_place_leaves_the_old_one(tmp_path, monkeypatch):
+    """On a system that cannot exchange folders, where the old one is moved aside before."""
+    folder_of(tmp_path / "a", "old")
+    rename = os.rename
+
+    def refused(made, target):
+        if made.parent.name == "ready":
+            raise PermissionError(13, "Permission denied")
+        rename(made, target)
+
+    monkeypatch.setattr(staging, "exchange", lambda one, other: False)
+    monkeypatch.setattr(os, "rename", refused)
+    with pytest.raises(OutputError, match="a cannot be written"):
+        folder_of(tmp_path / "a", "new")
+    assert (tmp_path / "a/inside/a").read_text() == "old" and [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
 def test_what_dead_runs_left_is_put_right_by_whoever_comes_next(tmp_path):
@@ -177,9 +204,11 @@ def test_what_a_living_run_makes_is_let_alone(tmp_path):
 
 
 def test_more_runs_than_there_is_room_for_end_in_one_sentence(tmp_path):
+    opened = len(os.listdir("/dev/fd"))
     living = [staging.Staging(tmp_path / "a") for _ in range(staging.SLOTS)]
     with pytest.raises(OutputError, match="a cannot be written: 8 other runs are writing to it"):
         text(tmp_path / "a")
+    assert len(os.listdir("/dev/fd")) == opened + len(living)
     for handle in living:
         handle.close()
     text(tmp_path / "a")

@@ -7,7 +7,7 @@ from itertools import product
 import pytest
 import tiny
 import torch
-from test_families import FAMILIES
+from hard_checkpoints import FAMILIES
 
 from mipmap_plugin.wrap import Wrapped, wrap_model
 

@@ -1,78 +1,20 @@
 """Every family of checkpoints with hard rows among ordinary ones: splats, image and gradients are finite, or the file is refused."""
 
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
-import anchor_checkpoints
-import moving
 import numpy as np
-import ply_files
 import pytest
 import tiny
-import torch_checkpoints
-from anchor_checkpoints import Layout
+from hard_checkpoints import COUNT, FAMILIES, Change, assert_finite, known, numbers
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_any_checkpoint import assert_finite, known, numbers
 
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import MipmapPluginError
-from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.models import load_model
 
-Change = tuple[str, int, float]  # a column, a row, and what stands there
-COUNT = 12
-
-
-def of_ply(make: Callable[[Path], object], folder: Path, changes: list[Change]) -> Path:
-    """The folder that `make` fills once, with changed numbers in its PLY. A name stands for every column that begins with it."""
-    sound = folder.with_name("sound.ply")
-    if not sound.exists():
-        make(folder)
-        shutil.copyfile(next(folder.rglob("*.ply")), sound)
-    columns = {name: column.copy() for name, column in read_ply(sound).columns.items()}
-    for prefix, row, value in changes:
-        for name in (name for name in columns if name.startswith(prefix)):
-            columns[name][row % len(columns[name])] = value
-    ply_files.write(next(folder.rglob("*.ply")), columns)
-    return folder
-
-
-def of_tensors(write: Callable[..., Path], folder: Path, changes: list[Change]) -> Path:
-    """As `of_ply`, for the projects that save with torch: a name stands for the whole row of the tensor."""
-    raw = torch_checkpoints.splats(COUNT)
-    names = {"x": "means", "scale": "scales", "rot": "quats", "opacity": "opacities", "f_dc": "sh0", "f_rest": "shN"}
-    for prefix, row, value in changes:
-        if prefix in names:
-            raw[names[prefix]][row % COUNT] = value
-    shutil.rmtree(folder, ignore_errors=True)
-    return write(folder, raw)
-
-
-def mip(folder: Path, options: str) -> None:
-    ply_files.write_splats(folder / "point_cloud/iteration_7000/point_cloud.ply", COUNT, 3)
-    file = folder / "point_cloud/iteration_7000/point_cloud.ply"
-    ply_files.write(file, {**read_ply(file).columns, "filter_3D": np.full(COUNT, 0.01, np.float32)})
-    (folder / "cfg_args").write_text(f"Namespace(sh_degree=1, {options})")
-
-
-ANCHORS = {"distance": ("opacity_mlp", "color_mlp")}
-FAMILIES = {
-    "3dgs": partial(of_ply, partial(tiny.folder, count=COUNT)),
-    "mip": partial(of_ply, partial(mip, options="kernel_size=0.1")),
-    "gof": partial(of_ply, partial(mip, options="use_decoupled_appearance=False, kernel_size=0.0")),
-    "analytic": partial(of_ply, partial(mip, options="load_allres=False")),
-    "scaffold": partial(of_ply, partial(anchor_checkpoints.write, layout=Layout(**ANCHORS), count=COUNT)),
-    "octree": partial(of_ply, partial(anchor_checkpoints.write, layout=Layout("octree", **ANCHORS, to_level="progressive"), count=COUNT)),
-    "deformable": partial(of_ply, partial(moving.write_deformable, state=moving.deform_state(width=16))),
-    "deformable, 6 DoF": partial(of_ply, partial(moving.write_deformable, state=moving.deform_state(width=16, six_dof=True))),
-    "4dgs": partial(of_ply, moving.write_hexplane),
-    "gsplat": partial(of_tensors, torch_checkpoints.gsplat_folder),
-    "splatfacto": partial(of_tensors, torch_checkpoints.splatfacto_folder),
-}
 PREFIXES = ["x", "z", "scale", "scale_0", "rot", "rot_0", "opacity", "f_dc", "f_rest", "filter_3D", "f_offset", "f_anchor_feat", "level", "extra"]
 
 # The part of the renderers' catalog that a file can hold.

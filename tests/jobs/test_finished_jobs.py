@@ -3,7 +3,7 @@
 from dataclasses import replace
 from unittest.mock import Mock
 
-import anchor_checkpoints
+import moving
 import pytest
 import tiny
 from small_jobs import job_of
@@ -140,7 +140,7 @@ def test_a_file_for_several_viewers_is_recognized(tmp_path):
 
 def test_splats_that_are_not_merged_are_recognized(tmp_path):
     job = job_of(tmp_path)
-    job = replace(job, base=replace(job.base, checkpoint=anchor_checkpoints.write(tmp_path / "scaffold")), target=tmp_path / "out")
+    job = replace(job, base=replace(job.base, checkpoint=moving.write_deformable(tmp_path / "moving")), target=tmp_path / "out")
     assert run_job(job).status == "done"
     assert finished(job) is not None
 

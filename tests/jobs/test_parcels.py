@@ -133,9 +133,11 @@ def test_an_interrupted_run_travels_with_its_states(tmp_path, changes, kept):
             except KeyboardInterrupt as interrupt:
                 return Outcome(job, "interrupted", reason=str(interrupt))
 
-    outcome = unpack(do_parcel(pack(job), interrupted), job)
+    delivery = do_parcel(pack(job), interrupted)
+    outcomes = [unpack(delivery, job) for _ in range(2)]  # where the state of an earlier interruption lies, too
     states = [job.target.with_name(f"out.ply{ending}") for ending in kept]
-    assert outcome.status == "interrupted" and sorted(job.target.parent.glob("*.resume*")) == states and not job.target.exists()
+    assert {outcome.status for outcome in outcomes} == {"interrupted"}
+    assert sorted(job.target.parent.glob("*.resume*")) == states and not job.target.exists()
     began = []
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("mipmap_plugin.adaptation.session.adapt", lambda run, *rest: began.append(run.step) or adapt(run, *rest))

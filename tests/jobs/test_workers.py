@@ -136,6 +136,13 @@ def test_an_interruption_is_told_once(tmp_path):
     assert str(outcome).count("interrupted") == 1 and str(replace(outcome, reason="")).endswith(": interrupted")
 
 
+def test_a_worker_does_all_its_jobs_in_one_process(worker, tmp_path, monkeypatch):
+    started, start = [], jobs_worker._start
+    monkeypatch.setattr(jobs_worker, "_start", lambda threads: started.append(threads) or start(threads))
+    assert {do(job_of(tmp_path, target=tmp_path / f"{number}.ply"), worker).status for number in range(2)} == {"done"}
+    assert started == [1]
+
+
 def test_a_worker_that_is_stopped_while_it_starts_begins_nothing(monkeypatch, tmp_path):
     worker, start = Worker(1), jobs_worker._start
     monkeypatch.setattr(jobs_worker, "_start", lambda threads: worker.stop() or start(threads))

@@ -102,7 +102,7 @@ def test_screws_of_any_angle_follow_the_published_formula(angle):
     shift, point = np.array([0.3, -0.2, 0.5]), np.array([1.0, 2.0, -1.0])
     expected = screw(axis + 1e-5, angle, shift / angle + 1e-5, point)
     moved = move_along_screw(*(torch.tensor(vector, dtype=torch.float64)[None] for vector in (point, angle * axis, shift)))
-    np.testing.assert_allclose(moved[0].numpy(), expected, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(moved[0].numpy(), expected, rtol=0, atol=1e-10)
 
 
 def test_no_gradient_passes_through_the_network(tmp_path):

@@ -139,6 +139,15 @@ def test_moments_share_the_means_that_they_were_evaluated_at():
     assert len({place.data_ptr() for place, _ in known._known.values()}) == 2
 
 
+def test_splats_that_moved_in_place_are_evaluated_anew():
+    """As an optimizer moves them."""
+    known, _ = counted_memory()
+    means = torch.ones(10, 3)
+    for _ in range(3):  # as the base's, and as others
+        assert torch.equal(known(means, 0.5)["means"], means / 2)
+        means += 1
+
+
 def test_many_splats_are_evaluated_in_parts(monkeypatch):
     monkeypatch.setattr(memory, "CHUNK", 4)
     known, asked = counted_memory()
@@ -163,6 +172,17 @@ def test_a_followed_model_moves_its_splats_as_before_until_they_are_far_off(tmp_
         student.parameters()["means"].add_(0.01)
     release(student)
     assert torch.equal(student.gaussians(camera).means, moving.moved_to(model.field, student.canonical, 0.7).means)
+
+
+def test_more_than_a_tenth_of_the_splats_have_to_move_far(tmp_path):
+    student = load_model(moving.write_deformable(tmp_path / "m")).copy()
+    student.follow(reach=0.1)
+    before = student.held.clone()
+    for far, followed in ((6, False), (7, True)):  # of 60
+        with torch.no_grad():
+            student.parameters()["means"][:far] += 1
+        student.follow(reach=0.1)
+        assert torch.equal(student.held, before) != followed
 
 
 def test_rows_that_are_left_move_as_before_without_an_evaluation(tmp_path, monkeypatch):
@@ -191,6 +211,11 @@ def test_other_rows_are_evaluated_anew(tmp_path):
     student.follow(reach=0.1)
     student.replace_parameters({name: tensor.detach()[:7].clone().requires_grad_() for name, tensor in student.parameters().items()})
     assert len(student.gaussians(moving.at(0.2))) == 7
+
+
+def test_a_slope_is_that_of_places_at_the_distance():
+    known, _ = counted_memory()  # which moves splats by 0, 1/4, ... 1 of their places
+    assert known.slope(torch.ones(10, 3), 0.3) == pytest.approx((1.875 / 5) ** 0.5)
 
 
 def test_the_reach_is_shorter_where_neighbors_move_otherwise(tmp_path):

@@ -22,10 +22,11 @@ def test_photographs_are_found_from_the_folder_above_images(tmp_path, folder, pr
     assert len(load_scene(tmp_path / "desk").images) == 2
 
 
-def test_photographs_of_another_folder_keep_the_field_of_view(tmp_path):
+@pytest.mark.parametrize("cfg", [{"images": "images_2"}, {"fork": 2, "ds": 2}], ids=["3dgs", "octree"])
+def test_photographs_of_another_folder_keep_the_field_of_view(tmp_path, cfg):
     write_text_model(tmp_path / "sparse/0", names(2), points=0)
     write_photographs(tmp_path / "images_2", ["000.png"], size=(32, 24))
-    scene = load_scene(tmp_path, {"images": "images_2", "eval": True})
+    scene = load_scene(tmp_path, {**cfg, "eval": True})
     there, absent = scene.cameras
     assert there.size == absent.size == (24, 32)  # the absent one by the name of its folder
     assert (there.fx, there.fy) == (absent.fx, absent.fy) == (35, 36)
@@ -53,6 +54,8 @@ def test_a_wide_lens_makes_photographs_larger_when_they_are_undistorted(tmp_path
     scene = load_scene(tmp_path)
     [view] = Photographs(scene, scene.cameras, (0, 0, 0)).cameras
     assert (view.width, view.height) == (77, 51)
+    write_photographs(tmp_path / "images_4", names(2), size=(16, 12))
+    assert scene.smaller(4) == (19, 13)
     (tmp_path / "images").rename(tmp_path / "images_2")
     write_photographs(tmp_path / "images_2", names(2), size=(32, 24))
     with pytest.raises(SettingsError, match="has 37 x 24 px, but the base was trained at 74 x 48 px"):

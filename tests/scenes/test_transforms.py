@@ -105,8 +105,9 @@ def test_a_stated_lens_follows_the_size_of_the_image(tmp_path):
 
 @pytest.mark.parametrize(
     ("own", "focal"),
-    [({"fl_x": 20}, (20, 20)), ({"camera_angle_x": math.pi / 2}, (4, 4)), ({"fl_x": 20, "fl_y": 21}, (20, 21)), ({"fl_y": 21}, (9, 21))],
-)
+    [({"fl_x": 20}, (20, 20)), ({"camera_angle_x": math.pi / 2}, (4, 4)), ({"fl_x": 20, "camera_angle_y": math.pi / 2}, (20, 3)),
+     ({"fl_x": 20, "fl_y": 21}, (20, 21)), ({"fl_y": 21}, (9, 21))],
+)  # fmt: skip
 def test_a_frames_own_focal_length_is_not_mixed_with_the_files(tmp_path, own, focal):
     save_image(tmp_path / "train/r_0.png")
     write_json(tmp_path / "transforms.json", {"fl_x": 9, "fl_y": 10, "camera_angle_x": 1.0, "frames": [frame(**own)]})

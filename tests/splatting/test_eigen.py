@@ -3,8 +3,10 @@
 import pytest
 import torch
 
-from mipmap_plugin.splatting.eigen import eigh3
-from mipmap_plugin.splatting.rotations import rotations
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.eigen import by_axes, eigh3
+from mipmap_plugin.splatting.projection import covariances_of
+from mipmap_plugin.splatting.rotations import quaternions, rotations
 
 
 def turned(variances: torch.Tensor, seed: int = 0) -> torch.Tensor:
@@ -29,6 +31,7 @@ MATRICES = {
     "two of a kind": of(2.0, 2.0, 1.0),
     "flat": of(1.0, 0.5, 0.0),
     "zero": torch.zeros(3, 3, 3, dtype=torch.float64),
+    "of all ratios": turned(10 ** (-12 * torch.rand(2000, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64))),
     "huge": of(1e200, 3e199, 1e-200),
     "tiny": of(1e-200, 3e-201, 2e-210),
     "diagonal": torch.diag_embed(torch.tensor([[3.0, 1.0, 2.0], [1.0, 1.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)),
@@ -48,7 +51,14 @@ def test_it_equals_torchs(name):
     torch.testing.assert_close(vectors.mT @ vectors, torch.eye(3, dtype=torch.float64).expand_as(vectors), atol=4e-15, rtol=0)
 
 
-def test_a_hundred_thousand_at_once():
-    matrices = turned(10 ** (-12 * torch.rand(100_000, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)))
-    values, vectors = eigh3(matrices)
-    assert ((matrices @ vectors - vectors * values[:, None]).abs() < 1e-14).all()
+def test_quaternions_of_rotations_are_those_that_made_them():
+    """Whichever of their numbers is the largest."""
+    quats = torch.nn.functional.normalize(torch.cat([torch.eye(4), torch.randn(50, 4, generator=torch.Generator().manual_seed(0))]).double())
+    found = quaternions(rotations(quats))
+    torch.testing.assert_close(found * (found * quats).sum(1, keepdim=True).sign(), quats)
+
+
+def test_splats_of_any_covariances_have_axes_and_no_reflections():
+    covariances = MATRICES["ordinary"][:50]
+    splats = Gaussians(torch.zeros(50, 3), torch.ones(50, 4), torch.ones(50, 3), torch.ones(50), torch.zeros(50, 1, 3), covariances.float())
+    torch.testing.assert_close(covariances_of(by_axes(splats)).double(), covariances, atol=1e-5, rtol=0)

@@ -28,3 +28,16 @@ def leaves(g: Gaussians) -> tuple[list[torch.Tensor], Gaussians]:
     """The same splats over fresh leaf tensors: (means, quats, scales, opacities, sh), Gaussians."""
     tensors = [t.detach().clone().requires_grad_() for t in (g.means, g.quats, g.scales, g.opacities, g.sh)]
     return tensors, Gaussians(*tensors)
+
+
+def t2_camera() -> Camera:
+    """FORMATS §13, T2: a view whose vectors are published."""
+    rows = [[0.726315789, -0.610526316, -0.315789474, 0.5], [0.526315789, 0.789473684, -0.315789474, -0.25],
+            [0.442105263, 0.063157895, 0.894736842, 4.0], [0, 0, 0, 1]]  # fmt: skip
+    return Camera(64, 48, 70.0, 72.0, 32.0, 24.0, torch.tensor(rows, dtype=torch.float64))
+
+
+def t3_gaussian() -> Gaussians:
+    """FORMATS §13, T3: a splat in it."""
+    t = lambda *x: torch.tensor([x], dtype=torch.float64)  # noqa: E731
+    return Gaussians(t(0.1, 0.2, 0.3), t(1, 0.5, -0.5, 0.25), t(0.2, 0.1, 0.05), torch.sigmoid(t(1.0))[0], t(0.5, -0.3, 0.1)[:, None])

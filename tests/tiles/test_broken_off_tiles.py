@@ -172,8 +172,17 @@ def test_a_run_that_is_interrupted_anywhere_goes_on_to_the_same_bytes(job, monke
     plan = [Sweep(0, 0, (1,), 0, 0), Sweep(1, 1, (2, 4), 1, 1), Sweep(2, 4, (5, 6), 2, 2)]
     monkeypatch.setattr("mipmap_plugin.tiles.scene.sweeps", lambda config: plan)
     job = replace(job, settings=job.settings | {"steps": 6, "warm_up": 0.0})
+    taken_over = []  # of a sweep before: Adam's moments, and time
+
+    def adapt(run, *rest):
+        taken_over.append((bool(run.optimizer.state), run.watch.seconds >= 1000))
+        return real_adapt(run, *rest)
+
+    monkeypatch.setattr(tile, "adapt", adapt)
+    monkeypatch.setattr(tile, "load_torch", lambda file: torch.load(file) | {"seconds": 1000.0})
     undisturbed = adapt_in_tiles(replace(job, target=job.target.with_name("other.ply")), 3)
     assert [tile["sweep"] for tile in undisturbed.tiles] == [0] * 3 + [1] * 3 + [2] * 3 + [3] * 3
+    assert taken_over == [(False, False)] * 3 + [(True, True)] * 3 + [(False, True)] * 3 + [(True, True)] * 3
     with pytest.raises(KeyboardInterrupt):
         adapt_in_tiles(job, 3, interrupted_at(work, sweep, number))
     assert columns_of(adapt_in_tiles(job, 3).file) == columns_of(undisturbed.file)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import importlib.util
 import weakref
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import tiny
 import torch
 
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
@@ -15,12 +17,12 @@ from mipmap_plugin.backends.base import AdamStep
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.tiles.folder import layer_file
-from mipmap_plugin.tiles.halo import _halos
-from mipmap_plugin.tiles.pictures import Album
+from mipmap_plugin.tiles.halo import PAD, _halos
+from mipmap_plugin.tiles.pictures import Album, new_pictures
 from mipmap_plugin.tiles.run import adapt_in_tiles
 from mipmap_plugin.tiles.steering import Steered, open_state
 from mipmap_plugin.tiles.store import Store
-from mipmap_plugin.tiles.surroundings import Surroundings, nothing
+from mipmap_plugin.tiles.surroundings import KEPT, Surroundings, nothing
 from mipmap_plugin.tiles.tile import Tile
 from mipmap_plugin.tiles.truth import Truths
 
@@ -68,16 +70,40 @@ def test_the_layers_of_a_view_are_not_all_in_memory_at_once(halved):
     assert max(most) <= 2
 
 
-def test_a_change_of_the_core_shows_as_far_as_the_halo_lets_it_through(halved):
+def test_the_surroundings_of_many_views_are_not_all_in_memory_at_once(halved, monkeypatch):
+    around = Surroundings(halved, 0, halved.sweeps[0])
+    monkeypatch.setattr(around, "_read", lambda name: name)
+    assert [around._surrounding(str(number)) for number in range(2 * KEPT)][-1] in around._kept and len(around._kept) == KEPT
+
+
+@pytest.mark.parametrize("changed", ["sh", "opacities"])
+def test_a_change_of_the_core_shows_as_far_as_the_halo_lets_it_through(halved, changed):
     """Close to what the whole shows: only where splats overlap across a cut do layers differ from it."""
     splats, view, rows, around = whole_and_tiles(halved)
     for own, halo in zip(rows, around, strict=True):
         crop = halo.crop(view)
-        brighter = splats.sh.clone()
-        brighter[own, 0] += 0.5
-        change = shown_in(halved, replace(splats, sh=brighter), view, crop) - shown_in(halved, splats, view, crop)
-        seen = halo.render(replace(splats, sh=brighter)[own], crop) - halo.render(splats[own], crop)
+        values = getattr(splats, changed).clone()
+        values[own] = values[own] + 0.5 if changed == "sh" else values[own] / 2
+        other = replace(splats, **{changed: values})
+        change = shown_in(halved, other, view, crop) - shown_in(halved, splats, view, crop)
+        seen = halo.render(other[own], crop) - halo.render(splats[own], crop)
         assert (seen - change).abs().mean() < 0.2 * change.abs().mean()
+
+
+def test_a_tile_has_pixels_around_what_is_seen_of_it_and_none_where_nearly_nothing_is(tmp_path):
+    """The first fills the left of a view, the second lies behind it, and leaves a pixel half open to the third."""
+    [view] = tiny.cameras(1, width=40, height=24)
+    pictures = torch.zeros(3, 24, 40, 4)
+    pictures[0, :, 20:, 3], pictures[1, 2, 30, 3] = 1.0, 0.5  # transmittances
+    layers = []
+    for number, picture in enumerate(pictures):
+        with new_pictures(tmp_path / str(number)) as write:
+            write(view.name, picture.half(), None)
+        layers.append(Album([tmp_path / str(number)]))
+    x = view.center[0].item()
+    scene = SimpleNamespace(tree=(0, x + 1, 0, (0, x + 2, 1, 2)), scale=1, target=SimpleNamespace(background=(0.0, 0.0, 0.0)))
+    boxes = {number: box for number, _, box in _halos(scene, view, layers)}
+    assert boxes == {0: (0, 0, 20 + PAD, 24), 1: (20 - PAD, 0, 40, 24)}
 
 
 def test_all_tiles_together_are_asked_to_mend_the_whole_error(halved):

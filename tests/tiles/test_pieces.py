@@ -9,7 +9,9 @@ import tiny
 import torch
 
 from mipmap_plugin.adaptation.start.blend_weights import weighed
+from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.ply import read_header
@@ -102,9 +104,22 @@ def test_rows_are_read_in_any_order(on_disk):
     assert torch.equal(splats.gaussians(rows).sh, in_memory[rows].sh)
     assert torch.equal(splats.places[:, :3], in_memory.means)
     assert len(splats.gaussians(rows[:0])) == 0
+    splats.opacities = torch.linspace(0, 1, 300)
+    assert torch.equal(splats.gaussians(rows).opacities, splats.opacities[rows])
 
 
-def test_splats_come_back_from_a_file_as_they_were(tmp_path):
+def test_splats_beside_a_picture_are_seen_as_far_as_they_reach():
+    """A splat of 5 px, three and seven of its standard deviations from each edge; and one behind the near plane."""
+    camera = Camera(40, 30, 50.0, 50.0, 20.0, 15.0, torch.eye(4))
+    at = [(u, v) for away in (15, 35) for u, v in ((-away, 15), (40 + away, 15), (20, -away), (20, 30 + away))]
+    places = torch.tensor([[(u - 20) / 5, (v - 15) / 5, 10.0, 1.0] for u, v in at] + [[0.0, 0.0, 0.1, 1.0]])
+    rows, depths = Splats(VanillaModel, [], places).seen_by(camera, 0.2)
+    assert rows.tolist() == [0, 1, 2, 3] and depths.tolist() == [10.0] * 4
+
+
+@pytest.mark.parametrize("piece", [7, 50])
+def test_splats_come_back_from_a_file_as_they_were(tmp_path, monkeypatch, piece):
+    monkeypatch.setattr("mipmap_plugin.tiles.store.PIECE", piece)
     model = tiny.model(50, degree=2)
     for name, read in stored(tmp_path / "a.splats", model).parameters().items():
         assert torch.equal(read, model.parameters()[name])
@@ -150,9 +165,12 @@ def test_slabs_give_the_picture_of_all_splats(on_disk, monkeypatch):
     assert torch.allclose(1 - Painter(backend, EFFECTS).draw(splats, camera).transmittance[..., 0], whole.alpha, atol=2e-4)
 
 
-def test_slabs_give_the_blend_weights_of_all_splats(on_disk, monkeypatch):
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_slabs_give_the_blend_weights_of_all_splats(on_disk, monkeypatch, backend):
+    if backend == "cpu":
+        pytest.importorskip("numba")
     splats, in_memory = on_disk
-    views, backend = tiny.cameras(3), ReferenceBackend()
+    views, backend = tiny.cameras(3), get_backend(backend)
     monkeypatch.setattr(slabs, "COLORLESS_SLAB", 37)
     expected, shown = weighed(in_memory, views, backend, EFFECTS)
     found = Painter(backend, EFFECTS).weighed(splats, views)

@@ -10,7 +10,7 @@ import tiny
 import torch
 from cut_scenes import config, cut_in_three
 
-from mipmap_plugin.adaptation.optimization.validation import Quality
+from mipmap_plugin.adaptation.optimization.validation import HARM_DB, TIE_DB, Quality
 from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS
 from mipmap_plugin.adaptation.schedule import ViewSchedule
 from mipmap_plugin.adaptation.start.strength import Merger
@@ -92,6 +92,8 @@ def test_what_is_in_the_picture_but_not_seen_is_weighed_in_more_views(job):
     search = StartSearch(cut_in_three(replace(job, base=Base(folder))))
     search.run()
     assert len(search.views) == 2 * LEAST_VIEWS
+    whole, _ = search.scene.painter(search.scene.base_effects).weighed(search.scene.base, search.views)
+    torch.testing.assert_close(search._measured(), whole * search.scene.scale**2)
 
 
 def test_splats_that_no_view_shows_are_told_of(job):
@@ -183,23 +185,27 @@ def test_a_loss_that_nobody_sees_is_no_harm(halved, measured, monkeypatch):
 
 @pytest.mark.parametrize(
     ("psnrs", "kept", "ceiling"),
-    [((31.0, 32.0), 2, 1.0), ((31.0, 30.95), 2, 1.0), ((31.0, 30.0), 1, 0.5), ((29.0,), 0, 0.5)],
-)
+    [((31.0, 32.0), 2, 1.0), ((31.0, 30.95), 2, 1.0), ((31.0, 30.0), 1, 0.5), ((29.0,), 0, 0.5),
+     ((31.0, 31.0 - TIE_DB / 2, 31.0 - HARM_DB - TIE_DB / 4), 2, 0.5)],  # of the best, though a tie is gone on with
+)  # fmt: skip
 def test_what_does_harm_to_the_whole_is_undone(halved, measured, monkeypatch, psnrs, kept, ceiling):
     measured(*psnrs)
     monkeypatch.setattr(steering, "rate_factor", lambda *_: 1.0)
-    steering.steer(halved, Sweep(0, 0, (1, 2), 0, 0))
+    steering.steer(halved, Sweep(0, 0, tuple(range(1, max(2, len(psnrs)) + 1)), 0, 0))
     after = Steered.before(halved.folder, 1)
     assert (max(after.step, 0), after.ceiling, tuple(after.checked)) == (kept, ceiling, psnrs)
 
 
 def test_a_little_loss_in_the_warm_up_is_no_harm_and_it_is_not_repeated(halved, measured, monkeypatch):
-    measured(32.0, 31.0, 29.0)
-    monkeypatch.setattr(halved, "config", halved.config.model_copy(update={"warm_up": 1.0}))
+    measured(32.0, 31.0, 29.0, 29.0)
+    monkeypatch.setattr(halved, "config", halved.config.model_copy(update={"warm_up": 0.75}))
     steering.steer(halved, Sweep(0, 0, (1, 2, 3), 0, 0))
     after = Steered.before(halved.folder, 1)
     assert (after.step, after.ceiling < 1) == (1, True)
     assert after.following is None or not after.following.repeats
+    steering.steer(halved, Sweep(1, 3, (4,), 1, 1))
+    again = Steered.before(halved.folder, 2).following
+    assert (again.first, again.checks, again.repeats) == (3, (4,), 1)  # none of the warm-up's steps
 
 
 def test_what_did_harm_is_done_again_in_front_of_the_same_halos_but_not_for_ever(halved, measured, monkeypatch):

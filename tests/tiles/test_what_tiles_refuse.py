@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import anchor_checkpoints
 import numpy as np
@@ -12,13 +14,16 @@ import torch
 from cut_scenes import cut_in_three, report, rewritten
 
 from mipmap_plugin.cli import main
-from mipmap_plugin.errors import BackendUnavailable, CheckpointError, SettingsError
+from mipmap_plugin.errors import BackendUnavailable, CheckpointError, OutputError, SettingsError
 from mipmap_plugin.formats.magic import SPLAT_RECORD
+from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.health import ACTIVATED
-from mipmap_plugin.tiles.folder import work_folder
+from mipmap_plugin.tiles import plan, reading
+from mipmap_plugin.tiles.folder import BASE, CUT, work_folder
+from mipmap_plugin.tiles.plan import refuse
 from mipmap_plugin.tiles.reading import find_splats, make_cut
 from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
 from mipmap_plugin.tiles.scene import opened
@@ -88,6 +93,40 @@ def test_requests_that_no_tiles_serve(job, changes, tiles, reason):
     with pytest.raises(SettingsError, match=reason):
         adapt_in_tiles(replace(job, **changes), tiles)
     assert not work_folder(job.target).exists()
+
+
+def test_of_a_file_that_is_read_part_by_part_any_part_tells_its_sh_degree(job, monkeypatch):
+    """And no camera sees a splat that is not finite."""
+    monkeypatch.setattr(reading, "CHUNK", 7)
+    monkeypatch.setattr(reading, "SAMPLE", 1)
+    row = np.arange(80)
+
+    def changed(columns):
+        one_row = {name: column * (row == 50) for name, column in columns.items() if name.startswith("f_rest_")}
+        return {**columns, **one_row, "opacity": np.where(row == 30, np.float32(np.nan), columns["opacity"])}
+
+    with pytest.warns(UserWarning, match="1 of 80 splats was dropped"):
+        make_cut(rewritten(job, changed), 2, job.target.parent)
+    stored = load_torch(job.target.parent / CUT)
+    assert stored["sample"].tolist() == [0, 50] and stored["places"].isfinite().all(dim=1).logical_not().nonzero().tolist() == [[30]]
+
+
+def test_the_cut_is_given_to_all_folders_with_what_it_is_of_before(job, monkeypatch):
+    """It says that both are there, to whoever goes on after a kill."""
+    jobs, linked = [job, replace(job, target=job.target.with_name("other.ply"))], []
+    monkeypatch.setattr(plan, "_link", lambda file, new: linked.append(new.name))
+    plan.claim(jobs, 2)
+    plan.cut_for(jobs, 2)
+    assert linked == [BASE, CUT]
+
+
+def test_the_cut_needs_room_for_the_base_twice_and_for_once_where_it_is_cut(job, monkeypatch):
+    size = next(job.base.checkpoint.rglob("*.ply")).stat().st_size
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=size * 3 // 2))
+    with pytest.raises(OutputError, match=f"and the tiles take at least {2 * size:,}"):
+        refuse(job, 2)
+    cut_in_three(job)
+    refuse(job, 3)
 
 
 def test_files_of_the_web_are_converted_before_they_are_cut(tmp_path):

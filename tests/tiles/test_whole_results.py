@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 import tiny
 import torch
-from cut_scenes import base_pictures
+from cut_scenes import base_pictures, cut_in_three
 
 from mipmap_plugin import register_viewer
 from mipmap_plugin.adaptation.optimization import loop
+from mipmap_plugin.adaptation.target.base_images import BaseImages
+from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.camera import viewmat_of
 from mipmap_plugin.cli import main
 from mipmap_plugin.formats import staging
@@ -33,6 +35,7 @@ from mipmap_plugin.splatting.viewers import Viewer
 from mipmap_plugin.tiles import plan, run
 from mipmap_plugin.tiles.reading import make_cut
 from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
+from mipmap_plugin.tiles.truth import Truths
 
 # The whole
 
@@ -156,6 +159,15 @@ def test_scales_share_the_cut_and_the_pictures_of_the_base(job, monkeypatch):
     files = [joined.file for joined in adapt_all_in_tiles(jobs, 2)]
     assert len(cuts) == 1 and sizes == [(16, 20)] * 5  # three views, and two of validation
     assert read_ply(files[1]).columns["x"].tobytes() == read_ply(alone).columns["x"].tobytes()
+
+
+@pytest.mark.parametrize("scale", [0.5, 0.125])
+def test_truths_are_those_without_tiles(job, scale):
+    """At x1/8 too, where the base is drawn with half of its pixels."""
+    scene = cut_in_three(replace(job, scale=scale))
+    expected = PseudoTruth(BaseImages(scene.wrapped.model, scene.backend, scene.base_effects), scale, scene.config)
+    for view in scene.used_views:
+        torch.testing.assert_close(Truths(scene)[view.name], expected(view), atol=1e-4, rtol=0)
 
 
 def test_scales_of_other_views_draw_their_own(job, monkeypatch):

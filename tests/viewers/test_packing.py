@@ -25,6 +25,11 @@ def test_spark_packs_scales_in_254_steps_and_opacities_in_steps_of_two():
     assert (code - code.round()).abs().max() < 1e-9 and (kept.opacities - splats.opacities).abs().max() < 1.6 / 255
 
 
+def test_harmonics_beyond_1_are_cut_off():
+    kept = packed(replace(splats := samples.gaussians(20), sh=10 * splats.sh), samples.camera(), find_viewer("spark").settings.packing).sh
+    assert 0.99 < kept[:, 1:].abs().max() < 1.01
+
+
 @pytest.mark.parametrize(("viewer", "most"), [("spark", 2.0), ("playcanvas", 0.3)])
 def test_packed_rotations_are_nearly_what_they_were(viewer, most):
     splats = samples.gaussians(500)

@@ -36,7 +36,7 @@ def decode(anchors: Anchors, weights: Weights, inputs: Mapping[str, tuple[str, .
     """
     means = anchors.means.detach()
     ray = means - camera.center.to(means)
-    distance = ray.norm(dim=1, keepdim=True).clamp_min(torch.finfo(ray.dtype).tiny)
+    distance = ray.norm(dim=1, keepdim=True)  # an anchor at the eye has no direction, but NaN, and no opacity above 0
     values = {"features": anchors.features, "direction": ray / distance, "distance": distance}
     if anchors.levels is not None:
         values["level"] = anchors.levels

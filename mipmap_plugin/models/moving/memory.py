@@ -98,7 +98,6 @@ class Memory:
             if self._latest is None or not torch.equal(self._latest, means):
                 self._latest = means.clone()  # which all moments share
             place = self._latest
-        self._known.pop((is_base, time), None)
         stale = [key for key, (old, _) in self._known.items() if old is not base and old is not self._latest]
         of_base = [] if is_base else [key for key in self._known if key[0]]
         limit = max(LIMIT, PART * memory(means.device)) if self._limit is None else self._limit

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import tiny
 import torch
-from test_start import COUNT, SCALE, adapted, start_of
+from small_starts import COUNT, SCALE, adapted, start_of
 
 from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
 from mipmap_plugin.adaptation.start import candidates

@@ -5,6 +5,7 @@ import weakref
 import pytest
 import tiny
 import torch
+from small_starts import COUNT, SCALE, adapted, start_of
 
 from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
 from mipmap_plugin.adaptation.parallel import VIEWS_AT_ONCE
@@ -20,18 +21,6 @@ from mipmap_plugin.splatting.viewers import find_viewer
 from mipmap_plugin.wrap import wrap_model
 
 pytestmark = pytest.mark.usefixtures("few_views")
-
-SCALE, COUNT = 1 / 4, 80
-
-
-def adapted(count=COUNT, scale=SCALE, **settings):
-    model = wrap_model(tiny.model(count), cameras=tiny.cameras())
-    return model.adapt(scale, **{"steps": 0, "merge_to": 1.0, "extra_views": 4, **settings})
-
-
-def start_of(report) -> str:
-    return next(name for name in report.validation if name.startswith("the start, ")).removeprefix("the start, ")
-
 
 def test_what_a_start_was_searched_with_is_gone_during_the_steps(monkeypatch):
     """The pairs of all rounds of merging, for one."""

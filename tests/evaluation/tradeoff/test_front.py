@@ -53,7 +53,8 @@ def test_the_knee_lies_furthest_above_the_line_between_the_ends():
 
 def test_a_front_of_one_point_has_no_knee():
     assert knee([BASE], seconds) is None
-    assert knee(front([BASE, RUN[1]], seconds), seconds).per_doubling_db is None
+    found = knee(front([BASE, RUN[1]], seconds), seconds)
+    assert found.point == RUN[1] and found.per_doubling_db is None
 
 
 def test_what_adapting_buys_is_said():

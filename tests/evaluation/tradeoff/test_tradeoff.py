@@ -60,11 +60,6 @@ def test_a_maximum_of_steps_is_one_run_of_a_recipe_without_steps():
     ]  # fmt: skip
 
 
-def test_photographs_need_the_cameras_of_the_checkpoint(tmp_path):
-    with pytest.raises(SettingsError, match="give its model folder"):
-        photographs(wrapped([]), load_scene(tiny.scene(tmp_path / "scene")), 1 / 4, None)
-
-
 @pytest.mark.parametrize(
     ("views", "judged"),
     [
