@@ -54,7 +54,7 @@ def test_views_to_its_sides_are_adapted_to_and_validated_by(scale):
 def test_levels_and_tradeoffs_are_measured_to_its_sides_too():
     lone = tiny.cameras(1)
     base = wrap_model(tiny.model(20), cameras=lone, backend="reference")
-    for judged in Yardstick(base, 0)._views, base_itself(base, 1 / 2, None).views, unseen(base, lone):
+    for judged in Yardstick(base, 0).views, base_itself(base, 1 / 2, None).views, unseen(base, lone):
         assert max((view.center - lone[0].center).norm() for view in judged) > SWAY / 4
 
 
