@@ -122,11 +122,12 @@ class Session:
         initial, start, notes = best_start(self._start_problems())
         self.notes = [note for note in notes if note == UNMATCHED or not (self.finer and self.finer.converts)]
         states = {AS_IT_IS: self._for_target(self.request.base_in_viewer, shared=True), f"the start, {start}": initial}
+        initial = self._with_more_bands(initial)
         curve, ended_by = list[CurvePoint](), "0 steps" + fewer_note(self.asked.steps, self.config.model_copy(update={"steps": 0}))
         pool.release_to_system()
         self.seconds["total"] = now(self.device) - began
         if self._takes_steps:
-            run, ended_by = self._optimize((initial := self._with_more_bands(initial)).copy(), resume, observe)
+            run, ended_by = self._optimize(initial.copy(), resume, observe)
             curve, states = run.curve, states | run.states(initial)
         return self._select(states, curve, ended_by)
 
@@ -151,12 +152,11 @@ class Session:
         return both if finer.converts else [from_level]
 
     def _with_more_bands(self, start: SplatModel) -> SplatModel:
-        """The start with the SH bands that it has room for, which are drawn from now on."""
-        most = min(self.config.most_sh_degree, max(self.drawn.most.values())) if self.config.most_splats is None else 0
-        start, degree = with_more_bands(start, self.base, self.request.images.effects.sh_degree, most)
-        before, self.drawn = self.drawn, self.drawn.with_bands(degree)
-        if self.drawn != before:
-            self.validation = replace(self.validation, renders=self.drawn.renders(self.backend))
+        """The start with the SH bands that steps can give it and that it has room for, which are drawn from now on."""
+        most = min(self.config.most_sh_degree, max(self.drawn.most.values())) if self._takes_steps and self.config.most_splats is None else 0
+        start, degree = with_more_bands(start, self.base, self.request.images.effects.sh_degree, most, self.request.viewer)
+        if (drawn := self.drawn.with_bands(degree)) != self.drawn:
+            self.drawn, self.validation = drawn, replace(self.validation, renders=drawn.renders(self.backend))
             self._compile(start)
         return start
 

@@ -1,10 +1,13 @@
 """SH bands that a zoom-out adds where merging has made room for them."""
 
+import time
+
 import pytest
 import tiny
 import torch
 
 from mipmap_plugin import wrap_model
+from mipmap_plugin.adaptation import session
 from mipmap_plugin.adaptation.start.bands import with_more_bands
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.models import load_model
@@ -27,7 +30,7 @@ def crowd(degree=0, room=None):
 def test_bands_are_those_that_leave_no_more_numbers_than_the_base_has(used, left):
     start = tiny.model(left, degree=used)
     fitting = [degree for degree in NUMBERS if degree >= used and left * NUMBERS[degree] <= 200 * NUMBERS[used]]
-    padded, degree = with_more_bands(start, tiny.model(200, degree=used), used, 3)
+    padded, degree = with_more_bands(start, tiny.model(200, degree=used), used, 3, None)
     assert padded.sh_degree == degree == max(fitting)
     splats = padded.gaussians()
     assert torch.equal(splats.sh[:, : (used + 1) ** 2], start.gaussians().sh)
@@ -35,12 +38,18 @@ def test_bands_are_those_that_leave_no_more_numbers_than_the_base_has(used, left
 
 
 def test_no_bands_are_added_beyond_those_that_are_asked_for():
-    padded, degree = with_more_bands(tiny.model(10, degree=0), tiny.model(200, degree=0), 0, 1)
+    padded, degree = with_more_bands(tiny.model(10, degree=0), tiny.model(200, degree=0), 0, 1, None)
     assert padded.sh_degree == degree == 1
 
 
+@pytest.mark.parametrize(("viewer", "left", "degree"), [("unity", 100, 0), ("unity", 45, 3), ("3dgs.cpp", 100, 3), ("spark", 100, 1)])
+def test_bands_that_a_loader_reads_only_as_others_count_as_those(viewer, left, degree):
+    """Unity's reads a PLY of degree 1 or 2 as one of 3, and 3DGS.cpp's every PLY, so that bands cost nothing there."""
+    assert with_more_bands(tiny.model(left, degree=0), tiny.model(200, degree=0), 0, 3, viewer)[1] == degree
+
+
 def test_bands_that_a_file_has_for_nothing_make_no_room():
-    padded, degree = with_more_bands(tiny.model(200, degree=3), tiny.model(200, degree=3), 0, 3)
+    padded, degree = with_more_bands(tiny.model(200, degree=3), tiny.model(200, degree=3), 0, 3, None)
     assert (padded.sh_degree, degree) == (3, 0)
 
 
@@ -68,6 +77,18 @@ def test_bands_that_a_file_has_for_nothing_are_used_where_merging_has_made_room(
 def test_no_bands_are_added_for(options):
     """A number of splats that stands for bytes, a viewer that draws none, the published method, and where nothing is learned."""
     assert crowd().adapt(1 / 8, **STEPS | options).model.sh_degree == 0
+
+
+def test_compiling_what_draws_more_bands_is_time_of_adapting(monkeypatch):
+    compiled = session.warm_up
+
+    def slowly(backend, gaussians, *rest):
+        time.sleep(0.5 if gaussians.sh_degree else 0)
+        compiled(backend, gaussians, *rest)
+
+    monkeypatch.setattr(session, "warm_up", slowly)
+    seconds = crowd().adapt(1 / 8, **STEPS).report.seconds
+    assert sum(seconds[name] for name in seconds if name not in ("total", "loading")) < seconds["total"] + 0.3
 
 
 def test_levels_have_the_bands_of_their_base():
