@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from mipmap_plugin.adaptation.renderers import Renderer
+from mipmap_plugin.adaptation.renderers import Renderer, unrounded
 from mipmap_plugin.adaptation.target.portable import extreme_targets
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.splatting.viewers import find_viewer
 
 # Bands that every renderer of training evaluates, as most viewers do (`Viewer.sh_degree`).
@@ -36,6 +37,16 @@ class Drawn:
     def renders(self, backend: Backend) -> list[Renderer]:
         """What draws as each of the extremes does."""
         return [Renderer(backend, target) for target in self.extremes.values()]
+
+    def renders_to_step(self, backend: Backend) -> list[Renderer]:
+        """What steps draw with: the same, `unrounded`."""
+        return [Renderer(backend, unrounded(target)) for target in self.extremes.values()]
+
+    def copied(self, model: SplatModel, *, shared: bool = False) -> SplatModel:
+        """A copy of a model that is rendered with the target's screen filter; `shared`: with the model's tensors, if it can have these."""
+        model = getattr(model, "shared", model.copy)() if shared else model.copy()
+        model.trained = model.trained.drawn_with(self.effects)
+        return model
 
     @cached_property
     def most(self) -> Mapping[str, int]:

@@ -6,6 +6,8 @@ phones and of the web's formats often have no bands, or one.
 
 from __future__ import annotations
 
+import torch
+
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting.viewers import degree_for
@@ -26,6 +28,12 @@ def with_more_bands(start: SplatModel, base: SplatModel, used: int, most: int, v
     room = max(len(base.parameters()["means"]) * _numbers(used), written(used))
     degree = max(used, *(each for each in range(most + 1) if written(each) <= room), 0)
     return start.with_degree(degree) if degree > start.sh_degree else start, degree
+
+
+@torch.no_grad()
+def used_degree(model: SplatModel) -> int:
+    """The highest SH degree of the splats of a model that may have got bands; 0 of others."""
+    return model.gaussians().used_sh_degree() if isinstance(model, VanillaModel) else 0
 
 
 def _numbers(degree: int) -> int:

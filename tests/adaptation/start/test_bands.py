@@ -8,10 +8,12 @@ import torch
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation import session
-from mipmap_plugin.adaptation.start.bands import with_more_bands
+from mipmap_plugin.adaptation.optimization.resume import Interrupted
+from mipmap_plugin.adaptation.start.bands import used_degree, with_more_bands
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.surfels import SurfelModel
 from mipmap_plugin.models.vanilla import VanillaModel
 
 NUMBERS = {0: 14, 1: 23, 2: 38, 3: 59}  # of a splat, by degree
@@ -89,6 +91,24 @@ def test_compiling_what_draws_more_bands_is_time_of_adapting(monkeypatch):
     monkeypatch.setattr(session, "warm_up", slowly)
     seconds = crowd().adapt(1 / 8, **STEPS).report.seconds
     assert sum(seconds[name] for name in seconds if name not in ("total", "loading")) < seconds["total"] + 0.3
+
+
+def interrupted(step, seconds, render):
+    if step == 6:
+        raise KeyboardInterrupt
+
+
+def test_a_resumed_run_draws_the_bands_that_it_has_whatever_its_start_has_now(tmp_path, monkeypatch):
+    """In a time budget, and on a GPU, merging may leave others the next time."""
+    with pytest.raises(Interrupted):
+        crowd().adapt(1 / 8, **STEPS, resume=tmp_path / "state", observe=interrupted)
+    monkeypatch.setattr(session, "best_start", lambda problems: (problems[0].base(), "the base", []))
+    adapted = crowd().adapt(1 / 8, **STEPS, resume=tmp_path / "state")
+    assert adapted.model.gaussians().used_sh_degree() == adapted.effects.sh_degree == 2
+
+
+def test_flat_splats_that_got_bands_are_drawn_with_them():
+    assert used_degree(SurfelModel(tiny.model(5, degree=2).parameters(), TrainedScale())) == 2
 
 
 def test_levels_have_the_bands_of_their_base():
