@@ -8,7 +8,7 @@ from functools import cached_property
 
 from mipmap_plugin.adaptation.renderers import Renderer, unrounded
 from mipmap_plugin.adaptation.target.portable import extreme_targets
-from mipmap_plugin.backends.base import Backend
+from mipmap_plugin.backends.base import Backend, Needs
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.splatting.viewers import find_viewer
@@ -52,6 +52,12 @@ class Drawn:
     def most(self) -> Mapping[str, int]:
         """The degree of the SH bands that each viewer draws."""
         return {name: find_viewer(name).sh_degree if name else USUAL_DEGREE for name in self.targets}
+
+    def most_of(self, backend: Backend, model: SplatModel) -> int:
+        """The highest degree of SH bands that one of the viewers draws, and the backend, of splats as the model's."""
+        means, degrees = model.parameters()["means"], range(max(self.most.values()), 0, -1)
+        needs = [Needs(means.device.type, means.dtype, True, 0, target.screen_filter, settings=target.settings) for target in self.targets.values()]
+        return next((each for each in degrees if not any(backend.lacking(replace(need, sh_degree=each)) for need in needs)), 0)
 
     def with_bands(self, degree: int) -> Drawn:
         """The same with SH bands up to `degree`, as far as viewers draw them. The base, which may have fewer, looks the same by it."""

@@ -10,6 +10,8 @@ from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation import session
 from mipmap_plugin.adaptation.optimization.resume import Interrupted
 from mipmap_plugin.adaptation.start.bands import used_degree, with_more_bands
+from mipmap_plugin.backends import register_backend
+from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import TrainedScale
@@ -109,6 +111,26 @@ def test_a_resumed_run_draws_the_bands_that_it_has_whatever_its_start_has_now(tm
 
 def test_flat_splats_that_got_bands_are_drawn_with_them():
     assert used_degree(SurfelModel(tiny.model(5, degree=2).parameters(), TrainedScale())) == 2
+
+
+class OfOneBand(ReferenceBackend):
+    """Of a third party, that draws only what it says."""
+
+    name = "one-band"
+
+    def lacking(self, needs):
+        return ["it has one band"] * (needs.sh_degree > 1)
+
+    def render(self, gaussians, camera, effects):
+        assert effects.sh_degree <= 1
+        return super().render(gaussians, camera, effects)
+
+
+def test_a_backend_is_asked_for_no_more_bands_than_it_draws():
+    register_backend("one-band", OfOneBand)
+    splats = crowd().model.gaussians().detach()
+    base = wrap_model(VanillaModel.from_gaussians(splats, TrainedScale()), cameras=tiny.cameras(8, width=96, height=72), backend="one-band")
+    assert base.adapt(1 / 8, **STEPS).model.gaussians().used_sh_degree() == 1
 
 
 def test_levels_have_the_bands_of_their_base():
