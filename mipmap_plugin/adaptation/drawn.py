@@ -1,4 +1,4 @@
-"""How a run draws the base, and what it makes of it."""
+"""How a run draws the base, and the files that it makes of it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ USUAL_DEGREE = 3
 
 @dataclass(frozen=True)
 class Drawn:
-    """The effects of both. Raises SettingsError for a viewer that is not registered."""
+    """The effects of the base, and of the file in each viewer. Raises SettingsError for a viewer that is not registered."""
 
     base: Effects
     targets: Mapping[str, Effects]  # by viewer; the file names the first of them
@@ -49,19 +49,19 @@ class Drawn:
         return model
 
     @cached_property
-    def most(self) -> Mapping[str, int]:
+    def degrees(self) -> Mapping[str, int]:
         """The degree of the SH bands that each viewer draws."""
         return {name: find_viewer(name).sh_degree if name else USUAL_DEGREE for name in self.targets}
 
-    def most_of(self, backend: Backend, model: SplatModel) -> int:
-        """The highest degree of SH bands that one of the viewers draws, and the backend, of splats as the model's."""
-        means, degrees = model.parameters()["means"], range(max(self.most.values()), 0, -1)
+    def most_degree(self, backend: Backend, model: SplatModel) -> int:
+        """The highest degree of SH bands that any of the viewers draws, and the backend of splats like the model's."""
+        means, degrees = model.parameters()["means"], range(max(self.degrees.values()), 0, -1)
         needs = [Needs(means.device.type, means.dtype, True, 0, target.screen_filter, settings=target.settings) for target in self.targets.values()]
         return next((each for each in degrees if not any(backend.lacking(replace(need, sh_degree=each)) for need in needs)), 0)
 
     def with_bands(self, degree: int) -> Drawn:
         """The same with SH bands up to `degree`, as far as viewers draw them. The base, which may have fewer, looks the same by it."""
-        targets = {name: _at_least(target, min(degree, self.most[name])) for name, target in self.targets.items()}
+        targets = {name: _at_least(target, min(degree, self.degrees[name])) for name, target in self.targets.items()}
         return Drawn(_at_least(self.base, degree), targets)
 
 

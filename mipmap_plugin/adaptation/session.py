@@ -155,7 +155,7 @@ class Session:
     def _with_more_bands(self, start: SplatModel) -> SplatModel:
         """The start with the SH bands that steps can give it and that it has room for, which are drawn from now on."""
         learns = self._takes_steps and self.config.most_splats is None
-        most = min(self.config.most_sh_degree, self.drawn.most_of(self.backend, start)) if learns else 0
+        most = min(self.config.most_sh_degree, self.drawn.most_degree(self.backend, start)) if learns else 0
         start, degree = with_more_bands(start, self.base, self.request.images.effects.sh_degree, most, self.request.viewer)
         self._draw_bands(start, degree)
         return start
