@@ -130,7 +130,7 @@ class AdaptConfig(Settings):
         description="Maximum loss by merging, in dB on validation views before the first step; at least 0.6, unless 0, for another renderer.",
     )
     most_sh_degree: int = Field(
-        default=0, ge=0, le=3, description="Zoom-out: add SH bands up to this degree, as far as merging has made room: no file gets larger by it."
+        default=0, ge=0, le=3, description="Zoom-out: add SH bands up to this degree, as far as merging has made room: no PLY gets larger by it."
     )
     most_splats: int | None = Field(default=None, gt=0, description="Merge to at most this many splats, whatever it costs, in place of `merge_to`.")
     rates: LearningRates = LearningRates()

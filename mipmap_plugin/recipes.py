@@ -45,8 +45,7 @@ ENDS = ("steps", "time_budget_s", "target_db")
 # In a time budget with room for more, 720 steps gain 0.6 dB on lego at x1/4, and 1440 1.2 dB.
 DEFAULT_OUT = dict(
     steps=360, most_steps=2500, most_draws=MOST_DRAWS, loss="psnr", decay=0.02, betas=(0.9, 0.95), nesterov=True, truth_oversampling=4,
-    views_per_step=4, order="spread", gathering=0.25, warm_up=0.1, extra_views=150, resize="fitting",
-    most_sh_degree=3,
+    views_per_step=4, order="spread", gathering=0.25, warm_up=0.1, extra_views=150, resize="fitting", most_sh_degree=3,
 )  # fmt: skip
 RATES_OUT = LearningRates(
     means=0.1, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.04, offsets=0.1, features=0.05, networks=5e-3

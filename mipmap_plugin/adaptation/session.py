@@ -23,11 +23,11 @@ from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Quality, Validation, split_validation
-from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, color_limits, unrounded, views_renderer
+from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, color_limits, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, option_note, simulated, versions
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer, ends_run
 from mipmap_plugin.adaptation.shown import refuse_blind, remarks, showing, too_unlike, worse_views
-from mipmap_plugin.adaptation.start.bands import with_more_bands
+from mipmap_plugin.adaptation.start.bands import used_degree, with_more_bands
 from mipmap_plugin.adaptation.start.candidates import UNMATCHED, best_start
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
 from mipmap_plugin.adaptation.start.problem import StartProblem
@@ -62,12 +62,13 @@ class Session:
     def __init__(self, request: AdaptationRequest, scale: float, config: AdaptConfig, cameras: list[Camera], photographs: Photographs | None) -> None:
         self.request, self.scale, self.finer = request, scale, request.finer
         self.base, self.backend = request.images.model, request.images.backend
-        self.drawn = Drawn(request.images.effects, request.targets).with_bands(self.finer.used_sh_degree() if self.finer else 0)
+        self.drawn = Drawn(request.images.effects, request.targets).with_bands(used_degree(self.finer.model) if self.finer else 0)
         self.asked, self.config = config, affordable_for_model(config, self.base, cameras, self.drawn.effects.near_plane)
         self._most_splats, self.device = config.most_splats or sys.maxsize, self.base.parameters()["means"].device
         self.viewpoints = replace(request.viewpoints, looks=looks_in_budget(self.config, self.base))
         self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.device)
         self._has_photographs, self._orbits = photographs is not None, not cameras or config.views == "orbit"
+        self._has_blend_weights = request.has_gradients and self.base.traits.same_for_all_views
         self.base_views, validation, self.views_note = self._choose_views(cameras)
         self.config = config = fitting(self.config, self.drawn.base, self.base_views, scale)
         self.seconds["total"] = sum(self.seconds.values())
@@ -111,7 +112,7 @@ class Session:
         near, wanted = self.drawn.base.near_plane, self.wanted or self.scale
         refuse_blind(self.base_views, self.base, near, self.truth, wanted)
         if self._base_is_right:
-            copy, reason = self._for_target(self.base), "scale 1, at which the base is right as it is"
+            copy, reason = self.drawn.copied(self.base), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.drawn.effects, self.drawn.targets)
         found = [too_unlike(self.base_views), too_far_out(self.base, self.base_views, self.drawn.targets), unused_upsampler(self.config, wanted)]
         for remark in filter(None, [*remarks(self.base_views, self.base, near, orbit=self._orbits), *found, option_note(self.base, wanted)]):
@@ -121,12 +122,13 @@ class Session:
         evaluate_moments(self.base, [*self.views, *self.validation.steering], self.phase)
         initial, start, notes = best_start(self._start_problems())
         self.notes = [note for note in notes if note == UNMATCHED or not (self.finer and self.finer.converts)]
-        states = {AS_IT_IS: self._for_target(self.request.base_in_viewer, shared=True), f"the start, {start}": initial}
+        states = {AS_IT_IS: self.drawn.copied(self.request.base_in_viewer, shared=True), f"the start, {start}": initial}
+        initial = self._with_more_bands(initial)
         curve, ended_by = list[CurvePoint](), "0 steps" + fewer_note(self.asked.steps, self.config.model_copy(update={"steps": 0}))
         pool.release_to_system()
         self.seconds["total"] = now(self.device) - began
         if self._takes_steps:
-            run, ended_by = self._optimize((initial := self._with_more_bands(initial)).copy(), resume, observe)
+            run, ended_by = self._optimize(initial.copy(), resume, observe)
             curve, states = run.curve, states | run.states(initial)
         return self._select(states, curve, ended_by)
 
@@ -140,25 +142,31 @@ class Session:
 
     def _start_problems(self) -> list[StartProblem]:
         from_base = StartProblem(
-            lambda: self._for_target(self.base, shared=True), self.base_views, self._closest_of, self.scale, self.drawn.base,
+            lambda: self.drawn.copied(self.base, shared=True), self.base_views, self._closest_of, self.scale, self.drawn.base,
             median_target(self.drawn.targets), self.config, self.backend, self._has_blend_weights, self.quality, self.phase,
             may_lose=self.config.merging_costs if len(self.drawn.targets) > 1 and self.config.steps else 0.0,
         )  # fmt: skip
         if (finer := self.finer) is None:
             return [from_base]
-        from_level = from_base.from_level(finer, lambda: self._for_target(finer.model, shared=True))
+        from_level = from_base.from_level(finer, lambda: self.drawn.copied(finer.model, shared=True))
         both = [from_level, from_base] if finer.learned else [from_base, from_level]
         return both if finer.converts else [from_level]
 
     def _with_more_bands(self, start: SplatModel) -> SplatModel:
-        """The start with the SH bands that it has room for, which are drawn from now on."""
-        most = min(self.config.most_sh_degree, max(self.drawn.most.values())) if self.config.most_splats is None else 0
-        start, degree = with_more_bands(start, self.base, self.request.images.effects.sh_degree, most)
-        before, self.drawn = self.drawn, self.drawn.with_bands(degree)
-        if self.drawn != before:
-            self.validation = replace(self.validation, renders=self.drawn.renders(self.backend))
-            self._compile(start)
+        """The start with the SH bands that steps can give it and that it has room for, which are drawn from now on."""
+        learns = self._takes_steps and self.config.most_splats is None
+        most = min(self.config.most_sh_degree, self.drawn.most_degree(self.backend, start)) if learns else 0
+        start, degree = with_more_bands(start, self.base, self.request.images.effects.sh_degree, most, self.request.viewer)
+        self._draw_bands(start, degree)
         return start
+
+    def _draw_bands(self, model: SplatModel, degree: int) -> bool:
+        """Draw SH bands up to a degree, those of the model, from now on; return whether these are more than until now."""
+        if (drawn := self.drawn.with_bands(degree)) == self.drawn:
+            return False
+        self.drawn, self.validation = drawn, replace(self.validation, renders=drawn.renders(self.backend))
+        self._compile(model)
+        return True
 
     def _select(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str) -> Adapted:
         """Return the best of the states on views that did not steer the run, or the last where the settings say so."""
@@ -195,7 +203,7 @@ class Session:
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
         """Run Algorithm 1 on `student`, or continue it from the state in `resume`; return the run and what ended it."""
-        renders = [Renderer(self.backend, unrounded(target)) for target in self.drawn.extremes.values()]
+        renders = self.drawn.renders_to_step(self.backend)
         keeper = StateKeeper(resume, self.request.fingerprint(self.scale, self.config, self.views))
         if not any(target.sh_degree for target in self.drawn.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no viewer evaluates view-dependent color, so that these coefficients need no gradient
@@ -206,6 +214,8 @@ class Session:
             self.seconds["total"] += self.seconds["upsampling"]
         task = self._task(student, renders)
         run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
+        if run.step and self._draw_bands(run.student, used_degree(run.student)):  # of a start that was merged further than this one
+            task = replace(self._task(run.student, renders := self.drawn.renders_to_step(self.backend)), max_splats=task.max_splats)
 
         def after_step(run: Run) -> bool:
             keeper.save_if_due(run)
@@ -232,12 +242,6 @@ class Session:
         told = run.ended_by.told(self.config, run.step, share)
         return run, told + (plan_note(run, self.config) or fewer_note(self.asked.steps, self.config)) + growth_note(run)
 
-    def _for_target(self, model: SplatModel, *, shared: bool = False) -> SplatModel:
-        """A copy of a model that is rendered with the target's screen filter; `shared`: with the model's tensors, if it can have these."""
-        model = getattr(model, "shared", model.copy)() if shared else model.copy()
-        model.trained = model.trained.drawn_with(self.drawn.effects)
-        return model
-
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
         """Count the seconds spent inside under a phase of that name, those of a GPU too."""
@@ -260,10 +264,6 @@ class Session:
     @property
     def _takes_steps(self) -> bool:
         return self._has_photographs or takes_steps(self.config, self.scale, self.drawn.base, self.drawn.targets.values())
-
-    @property
-    def _has_blend_weights(self) -> bool:
-        return self.request.has_gradients and self.base.traits.same_for_all_views
 
     def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str, returned: str, validation: dict[str, float]) -> Report:
         known = [*self.base.notes, *(self.finer.model.notes if self.finer else ())]

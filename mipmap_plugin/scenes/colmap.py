@@ -34,6 +34,7 @@ BETWEEN = ("0", "sparse", "colmap")
 # Folders beside that of photographs: of masks, as Brush reads them, and of what 3DGS's convert.py undistorts.
 MASKS, BENT = "masks", "input"
 
+
 def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     """The scene of a folder with `sparse/0` and images, or of the folder of the model itself.
 

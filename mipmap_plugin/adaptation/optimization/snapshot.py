@@ -50,10 +50,10 @@ class Snapshot:
 
     @torch.no_grad()
     def put_into(self, model: SplatModel, *, anew: bool = False) -> None:
-        """Set `model`, a copy of the snapshot's model, to the snapshot: in its own leaves, unless the number of rows is another, or `anew`."""
+        """Set `model`, a copy of the snapshot's model, to the snapshot: in its own leaves, unless their shapes are others, or `anew`."""
         parameters = model.parameters()
-        # A GPU sums blend weights in any order, so that merging again may leave another number of splats than a saved run has.
-        if anew or len(parameters["means"]) != len(self.rows["means"]):
+        # A GPU sums blend weights in any order, so that merging again may leave other splats than a saved run has, or room for other bands.
+        if anew or any(tensor.shape != self.rows[name].shape for name, tensor in parameters.items()):
             copies = neighbors(self.rows)  # of colors, which are most of the memory
             copies |= {name: tensor.clone() for name, tensor in self.rows.items() if copies[name] is tensor}
             model.replace_parameters({name: tensor.requires_grad_() for name, tensor in copies.items()})

@@ -6,21 +6,30 @@ phones and of the web's formats often have no bands, or one.
 
 from __future__ import annotations
 
+import torch
+
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.splatting.viewers import degree_for
 
 
-def with_more_bands(start: SplatModel, base: SplatModel, used: int, most: int) -> tuple[SplatModel, int]:
+def with_more_bands(start: SplatModel, base: SplatModel, used: int, most: int, viewer: str | None) -> tuple[SplatModel, int]:
     """The start, with SH bands of zeros where need be, and the degree up to which it has room for them: at most `most`, and at least `used`.
 
-    So many that it has no more numbers than the base, of whose bands those up to `used` count, as the others are 0. A checkpoint of gsplat's or
-    nerfstudio's own keeps its bands, which are part of what its program expects.
+    So many that a PLY for the `viewer`, whose loader may read some degrees only, has no more numbers than the base, of whose bands those up to `used`
+    count, as the others are 0. A checkpoint of gsplat's or nerfstudio's own keeps its bands, which are part of what its program expects.
     """
     if not isinstance(start, VanillaModel) or start.traits.placed:
         return start, used
     room = len(base.parameters()["means"]) * _numbers(used)
-    degree = max(used, *(each for each in range(most + 1) if len(start) * _numbers(each) <= room), 0)
+    degree = max(used, *(each for each in range(most + 1) if len(start) * _numbers(degree_for(viewer, each)) <= room), 0)
     return start.with_degree(degree) if degree > start.sh_degree else start, degree
+
+
+@torch.no_grad()
+def used_degree(model: SplatModel) -> int:
+    """The highest SH degree of the splats of a model that may have got bands; 0 of others."""
+    return model.gaussians().used_sh_degree() if isinstance(model, VanillaModel) else 0
 
 
 def _numbers(degree: int) -> int:

@@ -6,11 +6,9 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
-import torch
-
 from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.backends.base import Backend
-from mipmap_plugin.camera import ONE_PIXEL, Camera
+from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.models.base import SplatModel
@@ -25,11 +23,6 @@ class FinerLevel:
     name: str = "the finer level"  # what it is called in the report
     converts: bool = False  # it is the conversion at x1 before a zoom-in; what its views show of the base was told when it was made
     learned: bool = True  # steps have bettered it: in a time budget that has no time for two starts, it is worth more than the base
-
-    @torch.no_grad()
-    def used_sh_degree(self) -> int:
-        """The highest SH degree of its splats, which may have got bands that the base has not; 0 for rows that are no splats of 3DGS."""
-        return self.model.gaussians(ONE_PIXEL).used_sh_degree() if self.model.traits.plain else 0
 
 
 @dataclass(frozen=True, eq=False)

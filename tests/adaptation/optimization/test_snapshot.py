@@ -95,3 +95,10 @@ def test_columns_of_a_file_stay_with_the_rows_that_they_belong_to(rows_changed):
     assert all(torch.equal(tensor, taken.rows[name]) for name, tensor in held.parameters().items())
     assert ("confidence" in held.extras) != rows_changed
     assert "confidence" in began.extras and not torch.equal(began.parameters()["means"], taken.rows["means"])
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_a_snapshot_of_other_bands_is_put_into_as_many_splats(degree):
+    model, taken = tiny.model(5, degree=1).copy(), Snapshot.of(tiny.model(5, degree=degree, seed=1))
+    taken.put_into(model)
+    assert model.sh_degree == degree and all(torch.equal(taken.rows[name], tensor) for name, tensor in model.parameters().items())

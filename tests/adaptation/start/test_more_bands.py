@@ -1,14 +1,21 @@
 """SH bands that a zoom-out adds where merging has made room for them."""
 
+import time
+
 import pytest
 import tiny
 import torch
 
 from mipmap_plugin import wrap_model
-from mipmap_plugin.adaptation.start.bands import with_more_bands
+from mipmap_plugin.adaptation import session
+from mipmap_plugin.adaptation.optimization.resume import Interrupted
+from mipmap_plugin.adaptation.start.bands import used_degree, with_more_bands
+from mipmap_plugin.backends import register_backend
+from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.surfels import SurfelModel
 from mipmap_plugin.models.vanilla import VanillaModel
 
 NUMBERS = {0: 14, 1: 23, 2: 38, 3: 59}  # of a splat, by degree
@@ -27,7 +34,7 @@ def crowd(degree=0, room=None):
 def test_bands_are_those_that_leave_no_more_numbers_than_the_base_has(used, left):
     start = tiny.model(left, degree=used)
     fitting = [degree for degree in NUMBERS if degree >= used and left * NUMBERS[degree] <= 200 * NUMBERS[used]]
-    padded, degree = with_more_bands(start, tiny.model(200, degree=used), used, 3)
+    padded, degree = with_more_bands(start, tiny.model(200, degree=used), used, 3, None)
     assert padded.sh_degree == degree == max(fitting)
     splats = padded.gaussians()
     assert torch.equal(splats.sh[:, : (used + 1) ** 2], start.gaussians().sh)
@@ -35,12 +42,18 @@ def test_bands_are_those_that_leave_no_more_numbers_than_the_base_has(used, left
 
 
 def test_no_bands_are_added_beyond_those_that_are_asked_for():
-    padded, degree = with_more_bands(tiny.model(10, degree=0), tiny.model(200, degree=0), 0, 1)
+    padded, degree = with_more_bands(tiny.model(10, degree=0), tiny.model(200, degree=0), 0, 1, None)
     assert padded.sh_degree == degree == 1
 
 
+@pytest.mark.parametrize(("viewer", "left", "degree"), [("unity", 100, 0), ("unity", 45, 3), ("3dgs.cpp", 100, 0), ("spark", 100, 1)])
+def test_bands_that_a_loader_reads_only_as_others_count_as_those(viewer, left, degree):
+    """Unity's reads a PLY of degree 1 or 2 as one of 3, and 3DGS.cpp's every PLY."""
+    assert with_more_bands(tiny.model(left, degree=0), tiny.model(200, degree=0), 0, 3, viewer)[1] == degree
+
+
 def test_bands_that_a_file_has_for_nothing_make_no_room():
-    padded, degree = with_more_bands(tiny.model(200, degree=3), tiny.model(200, degree=3), 0, 3)
+    padded, degree = with_more_bands(tiny.model(200, degree=3), tiny.model(200, degree=3), 0, 3, None)
     assert (padded.sh_degree, degree) == (3, 0)
 
 
@@ -68,6 +81,56 @@ def test_bands_that_a_file_has_for_nothing_are_used_where_merging_has_made_room(
 def test_no_bands_are_added_for(options):
     """A number of splats that stands for bytes, a viewer that draws none, the published method, and where nothing is learned."""
     assert crowd().adapt(1 / 8, **STEPS | options).model.sh_degree == 0
+
+
+def test_compiling_what_draws_more_bands_is_time_of_adapting(monkeypatch):
+    compiled = session.warm_up
+
+    def slowly(backend, gaussians, *rest):
+        time.sleep(0.5 if gaussians.sh_degree else 0)
+        compiled(backend, gaussians, *rest)
+
+    monkeypatch.setattr(session, "warm_up", slowly)
+    seconds = crowd().adapt(1 / 8, **STEPS).report.seconds
+    assert sum(seconds[name] for name in seconds if name not in ("total", "loading")) < seconds["total"] + 0.3
+
+
+def interrupted(step, seconds, render):
+    if step == 6:
+        raise KeyboardInterrupt
+
+
+def test_a_resumed_run_draws_the_bands_that_it_has_whatever_its_start_has_now(tmp_path, monkeypatch):
+    """In a time budget, and on a GPU, merging may leave others the next time."""
+    with pytest.raises(Interrupted):
+        crowd().adapt(1 / 8, **STEPS, resume=tmp_path / "state", observe=interrupted)
+    monkeypatch.setattr(session, "best_start", lambda problems: (problems[0].base(), "the base", []))
+    adapted = crowd().adapt(1 / 8, **STEPS, resume=tmp_path / "state")
+    assert adapted.model.gaussians().used_sh_degree() == adapted.effects.sh_degree == 2
+
+
+def test_flat_splats_that_got_bands_are_drawn_with_them():
+    assert used_degree(SurfelModel(tiny.model(5, degree=2).parameters(), TrainedScale())) == 2
+
+
+class OfOneBand(ReferenceBackend):
+    """Of a third party, that draws only what it says."""
+
+    name = "one-band"
+
+    def lacking(self, needs):
+        return ["it has one band"] * (needs.sh_degree > 1)
+
+    def render(self, gaussians, camera, effects):
+        assert effects.sh_degree <= 1
+        return super().render(gaussians, camera, effects)
+
+
+def test_a_backend_is_asked_for_no_more_bands_than_it_draws():
+    register_backend("one-band", OfOneBand)
+    splats = crowd().model.gaussians().detach()
+    base = wrap_model(VanillaModel.from_gaussians(splats, TrainedScale()), cameras=tiny.cameras(8, width=96, height=72), backend="one-band")
+    assert base.adapt(1 / 8, **STEPS).model.gaussians().used_sh_degree() == 1
 
 
 def test_levels_have_the_bands_of_their_base():

@@ -22,6 +22,7 @@ from mipmap_plugin.wrap import wrap_model
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
+
 def test_what_a_start_was_searched_with_is_gone_during_the_steps(monkeypatch):
     """The pairs of all rounds of merging, for one."""
     found = list[weakref.ref[candidates.Rounds]]()
