@@ -54,8 +54,11 @@ class Drawn:
         return {name: find_viewer(name).sh_degree if name else USUAL_DEGREE for name in self.targets}
 
     def most_degree(self, backend: Backend, model: SplatModel) -> int:
-        """The highest degree of SH bands that any of the viewers draws, and the backend of splats like the model's."""
-        means, degrees = model.parameters()["means"], range(max(self.degrees.values()), 0, -1)
+        """The highest degree of SH bands that all of the viewers draw, and the backend of splats like the model's.
+
+        Of several viewers the worst counts: what others learn by their bands is wrong in one that draws none.
+        """
+        means, degrees = model.parameters()["means"], range(min(self.degrees.values()), 0, -1)
         needs = [Needs(means.device.type, means.dtype, True, 0, target.screen_filter, settings=target.settings) for target in self.targets.values()]
         return next((each for each in degrees if not any(backend.lacking(replace(need, sh_degree=each)) for need in needs)), 0)
 

@@ -77,9 +77,11 @@ def test_bands_that_a_file_has_for_nothing_are_used_where_merging_has_made_room(
     assert adapted.model.sh_degree == 3 and adapted.model.gaussians().used_sh_degree() == 2
 
 
-@pytest.mark.parametrize("options", [dict(most_splats=40), dict(viewer="gaussian-splats-3d"), dict(recipe="paper"), dict(steps=0)])
+@pytest.mark.parametrize(
+    "options", [dict(most_splats=40), dict(viewer="gaussian-splats-3d"), dict(viewer="portable"), dict(recipe="paper"), dict(steps=0)]
+)
 def test_no_bands_are_added_for(options):
-    """A number of splats that stands for bytes, a viewer that draws none, the published method, and where nothing is learned."""
+    """A number of splats that stands for bytes, a viewer that draws none, alone or of several, the published method, and where nothing is learned."""
     assert crowd().adapt(1 / 8, **STEPS | options).model.sh_degree == 0
 
 
