@@ -105,6 +105,7 @@ def adapt(
     """
     if splats is not None and splats < 1:
         raise SettingsError(f"splats: must be at least 1, got {splats}")
+    size, limited = None if bytes is None else read_size(bytes), splats is not None or bytes is not None
     settings = without_none(**vars(changes), most_splats=splats) | dict(recipe=recipe, seed=seed)
     base = Base(Path(), cameras, background, backend, screen_filter, up)
     if many.tiles is not None or many.asked(checkpoints):
@@ -112,8 +113,6 @@ def adapt(
         request = Request(_requests(scale, viewer), output, settings, images, overwrite)
         return (adapt_many if many.tiles is None else adapt_tiled)(many, checkpoints, request, base, threads, json)
     [checkpoint] = checkpoints
-    size = None if bytes is None else read_size(bytes)
-    limited = splats is not None or size is not None
     request = Request(_requests(scale or ([1.0] if limited else ()), viewer), output, settings, images, overwrite)
     jobs = _jobs(replace(base, checkpoint=checkpoint), request)  # raises what it can before the checkpoint is read, which may take long
     base, images = jobs[0].base, jobs[0].images  # with its name in their paths
