@@ -103,8 +103,6 @@ def adapt(
         overwrite: Replace outputs that exist.
         json: Print the reports as JSON.
     """
-    if splats is not None and splats < 1:
-        raise SettingsError(f"splats: must be at least 1, got {splats}")
     size, limited = None if bytes is None else read_size(bytes), splats is not None or bytes is not None
     settings = without_none(**vars(changes), most_splats=splats) | dict(recipe=recipe, seed=seed)
     base = Base(Path(), cameras, background, backend, screen_filter, up)
@@ -112,17 +110,15 @@ def adapt(
         _refuse_for_many(bool(checkpoints or many.list), scale, bytes, report)
         request = Request(_requests(scale, viewer), output, settings, images, overwrite)
         return (adapt_many if many.tiles is None else adapt_tiled)(many, checkpoints, request, base, threads, json)
-    [checkpoint] = checkpoints
     request = Request(_requests(scale or ([1.0] if limited else ()), viewer), output, settings, images, overwrite)
-    jobs = _jobs(replace(base, checkpoint=checkpoint), request)  # raises what it can before the checkpoint is read, which may take long
+    jobs = _jobs(replace(base, checkpoint=checkpoints[0]), request)  # raises what it can before the checkpoint is read, which may take long
     base, images = jobs[0].base, jobs[0].images  # with its name in their paths
     wrapped = wrap(base, threads, images)
     if limited:
         jobs = _jobs(base, _limited(request, wrapped, jobs, size, fits=not scale))
     before = {} if overwrite or len(jobs) == 1 else finished_before(jobs, json)  # a single file is made or refused
-    left = [job for job in jobs if job.target not in before]
-    _check(wrapped, left)
-    page = AdaptationPage(checkpoint, [job.target for job in jobs], overwrite) if report else None
+    _check(wrapped, left := [job for job in jobs if job.target not in before])
+    page = AdaptationPage(checkpoints[0], [job.target for job in jobs], overwrite) if report else None
     made = _made(wrapped, left, None if images is None else scene(base, images), page, json)
     if page and not page.of_one:
         page.write(made, [*before.values()])
