@@ -30,8 +30,7 @@ def evaluation_page_path(checkpoint: Path, output: Path | None) -> Path:
     """The page beside `output`, or else in this folder under a name that is free."""
     if output:
         return output.with_suffix(".html")
-    name = os.path.basename(os.path.realpath(checkpoint))  # of a link to itself too, which is refused later
-    free = (Path(f"{name}.evaluation{f'-{number}' if number > 1 else ''}.html") for number in count(1))
+    free = (Path(f"{named(checkpoint).name}.evaluation{f'-{number}' if number > 1 else ''}.html") for number in count(1))
     return next(path for path in free if not os.path.lexists(path))
 
 
