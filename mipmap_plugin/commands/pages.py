@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import this_command
-from mipmap_plugin.formats.atomic import absolute, named, refuse_output, refuse_unwritable
+from mipmap_plugin.formats.atomic import named, refuse_output, refuse_unwritable
 from mipmap_plugin.formats.here import from_here
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class AdaptationPage:
         """Raises now the errors that writing the page would raise: OutputExists and OutputError."""
         from mipmap_plugin.models.places import PAGE_ENDING
 
-        name, target, self.of_one = named(checkpoint).name, absolute(targets[0]), len(targets) == 1  # a link is replaced in its own place
+        name, target, self.of_one = named(checkpoint).name, named(targets[0]), len(targets) == 1
         self.path = target.with_name(f"{target.name if self.of_one else f'{name}_adapted'}{PAGE_ENDING}")
         self._title, self._overwrite, self._zooms = name, overwrite, list[Any]()
         refuse_output(self.path, overwrite, is_file=True)
