@@ -48,9 +48,11 @@ def test_evaluate_tells_of_photographs_of_another_scene(tmp_path, capsys, seed, 
     assert (DOUBT in capsys.readouterr().err) == told
 
 
-def test_photographs_whose_cameras_are_given_too_are_told_of_once(tmp_path, capsys):
-    base, images = tiny.ply(tmp_path / "base.ply"), str(tiny.scene(tmp_path / "scene", tiny.cameras(4, seed=9, split="test"), seed=5))
-    assert main(["evaluate", str(base), "--images", images, "--cameras", images, "--scale", "1/2", "--no-report"]) == 0
+@pytest.mark.parametrize("words", ["evaluate --scale 1/2 --no-report", "adapt --scale 2 --steps 1"])
+def test_photographs_whose_cameras_are_given_too_are_told_of_once(tmp_path, capsys, words):
+    command, *more = words.split()
+    images = str(tiny.scene(tmp_path / "scene", tiny.cameras(4, seed=9, split="test"), tiny.cameras(4), seed=5))
+    assert main([command, str(tiny.ply(tmp_path / "base.ply")), "--images", images, "--cameras", images, *more]) == 0
     assert "".join(capsys.readouterr().err.split()).count("theymaybeofanotherscene") == 1
 
 
