@@ -49,6 +49,8 @@ class WrapOptions(TypedDict, total=False):
 class Wrapped(FrozenBase):
     """A frozen base model with its cameras, ready to be adapted to any scale and made into levels. It never changes."""
 
+    doubted = False  # whether a warning told that the photographs of its cameras show something else
+
     @in_usual_modes
     def levels(self, viewer: str, *, resume: str | Path | None = None, **options: Any) -> Ladder:
         """Return a ladder of levels (`levels.finished.Ladder`), to be saved with `save(folder)`. `options`: those of `LadderRequest.of`.
@@ -169,6 +171,7 @@ def warn_of_others(wrapped: Wrapped, scene: Scene, render: Callable[..., Rendere
     except MipmapPluginError:  # such as a damaged photograph, which cameras do without
         return
     if doubt:
+        wrapped.doubted = True
         warn(doubt)
 
 

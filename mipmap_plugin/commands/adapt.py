@@ -16,15 +16,27 @@ from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.pages import AdaptationPage, look_at
 from mipmap_plugin.commands.terminal_picture import show_before_and_after
 from mipmap_plugin.commands.tiled import adapt_tiled
-from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoints, Scale, ScreenFilter, Seed, Threads, Up, Viewer, unique_scales
+from mipmap_plugin.commands.types import (
+    BackendName,
+    Background,
+    Cameras,
+    Checkpoints,
+    Scale,
+    ScreenFilter,
+    Seed,
+    Threads,
+    Up,
+    Viewer,
+    read_size,
+    unique_scales,
+)
 from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
-from mipmap_plugin.errors import SettingsError, plural
+from mipmap_plugin.errors import CheckpointError, SettingsError, plural
 from mipmap_plugin.formats.atomic import together
 from mipmap_plugin.formats.here import from_here
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job
-from mipmap_plugin.jobs.listing import is_output
 from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
@@ -91,22 +103,22 @@ def adapt(
         overwrite: Replace outputs that exist.
         json: Print the reports as JSON.
     """
-    settings, base = without_none(**vars(changes)) | dict(recipe=recipe, seed=seed), Base(Path(), cameras, background, backend, screen_filter, up)
+    size, limited = None if bytes is None else read_size(bytes), splats is not None or bytes is not None
+    settings = without_none(**vars(changes), most_splats=splats) | dict(recipe=recipe, seed=seed)
+    base = Base(Path(), cameras, background, backend, screen_filter, up)
     if many.tiles is not None or many.asked(checkpoints):
         _refuse_for_many(bool(checkpoints or many.list), scale, bytes, report)
-        request = Request(_requests(scale, viewer), output, settings | without_none(most_splats=splats), images, overwrite)
+        request = Request(_requests(scale, viewer), output, settings, images, overwrite)
         return (adapt_many if many.tiles is None else adapt_tiled)(many, checkpoints, request, base, threads, json)
-    [checkpoint] = checkpoints
-    base, limited = replace(base, checkpoint=checkpoint), splats is not None or bytes is not None
     request = Request(_requests(scale or ([1.0] if limited else ()), viewer), output, settings, images, overwrite)
-    jobs = _jobs(base, request)  # raises what it can before the checkpoint is read, which may take long
+    jobs = _jobs(replace(base, checkpoint=checkpoints[0]), request)  # raises what it can before the checkpoint is read, which may take long
+    base, images = jobs[0].base, jobs[0].images  # with its name in their paths
     wrapped = wrap(base, threads, images)
     if limited:
-        jobs = _jobs(base, _limited(request, wrapped, jobs, (splats, bytes), fits=not scale))
+        jobs = _jobs(base, _limited(request, wrapped, jobs, size, fits=not scale))
     before = {} if overwrite or len(jobs) == 1 else finished_before(jobs, json)  # a single file is made or refused
-    left = [job for job in jobs if job.target not in before]
-    _check(wrapped, left)
-    page = AdaptationPage(checkpoint, [job.target for job in jobs], overwrite) if report else None
+    _check(wrapped, left := [job for job in jobs if job.target not in before])
+    page = AdaptationPage(checkpoints[0], [job.target for job in jobs], overwrite) if report else None
     made = _made(wrapped, left, None if images is None else scene(base, images), page, json)
     if page and not page.of_one:
         page.write(made, [*before.values()])
@@ -132,10 +144,22 @@ def _jobs(base: Base, request: Request) -> list[Job]:
     job, *others = jobs_of(base.checkpoint, request, base)
     refuse([job, *others])
     output = None if others or request.overwrite else request.output
-    if output and output.is_dir() and not is_output(output):
+    if output and output.is_dir() and not _is_adapted_model(output):
         within = adapted_path(base.checkpoint, output, job.scale, job.viewer, several=True)
         raise SettingsError(f"{output} is a folder; give the path of what is to be written, such as {within}")
     return [job, *others]
+
+
+def _is_adapted_model(folder: Path) -> bool:
+    """Whether an adaptation has made a folder itself, and not only files in it."""
+    from mipmap_plugin.models import detect
+    from mipmap_plugin.models.outputs import is_adapted
+
+    try:
+        found = detect(folder)
+    except (CheckpointError, OSError):
+        return False
+    return found.folder is not None and is_adapted(found.path)
 
 
 def _check(base: Wrapped, jobs: Sequence[Job]) -> None:
@@ -182,23 +206,20 @@ def _requests(scales: Sequence[float], viewers: tuple[str, ...]) -> list[tuple[f
     return [(scale, name) for scale in unique_scales(scales) for name in names]
 
 
-def _limited(request: Request, base: Wrapped, jobs: Sequence[Job], limits: tuple[int | None, str | None], *, fits: bool) -> Request:
-    """The request with the smaller of a number of splats and of what fits into a size, the `limits`; `fits`: at the scale that so many splats suit.
+def _limited(request: Request, base: Wrapped, jobs: Sequence[Job], size: int | None, *, fits: bool) -> Request:
+    """The request with no more splats than fit into a size in bytes, too; `fits`: at the scale that so many splats suit.
 
     `jobs`: those of the request as it is. Raises SettingsError.
     """
-    from mipmap_plugin.levels.fitting import ANY_SCALE, fitting_scale, read_size, recorded, splats_within
+    from mipmap_plugin.levels.fitting import ANY_SCALE, fitting_scale, recorded, splats_within
 
-    most, size = limits
-    if most is not None and most < 1:
-        raise SettingsError(f"splats: must be at least 1, got {most}")
+    counts = [request.settings["most_splats"]] if "most_splats" in request.settings else []
     if size is not None:
-        allowed = read_size(size)
         record = recorded(base, [(ANY_SCALE if fits else scale, viewer) for scale, viewer in request.targets], request.settings)
         files = {job.target.suffix: job.target.name for job in jobs}  # a viewer may want another format
         with announced("trying how large a file is"):
-            most = min([splats_within(base.model, allowed, name, record) for name in files.values()] + ([] if most is None else [most]))
-    assert most is not None
+            counts += [splats_within(base.model, size, name, record) for name in files.values()]
+    most = min(counts)
     targets = [(fitting_scale(most, base.model) if fits else scale, viewer) for scale, viewer in request.targets]
     return replace(request, targets=targets, settings={**request.settings, "most_splats": most})
 

@@ -80,7 +80,7 @@ def evaluate(
     with resumable(results.kept, "row"):
         for name, path, folder, own in zip(_names(checkpoint, images), checkpoint, images, cameras or [None] * len(checkpoint), strict=True):
             base = Base(path, own, background, backend, screen_filter)
-            wrapped, photographs = wrap(base, threads, folder), scene(base, folder)
+            wrapped, photographs = wrap(base, threads), scene(base, folder)
             photographs = photographs.numbered_as_upstream() if appearance == "upstream" else photographs
             results.refuse_output([*photographs.images.values()], overwrite)
             results.measure(name, wrapped, photographs, appearance, recipe, settings)

@@ -30,8 +30,7 @@ def evaluation_page_path(checkpoint: Path, output: Path | None) -> Path:
     """The page beside `output`, or else in this folder under a name that is free."""
     if output:
         return output.with_suffix(".html")
-    name = os.path.basename(os.path.realpath(checkpoint))  # of a link to itself too, which is refused later
-    free = (Path(f"{name}.evaluation{f'-{number}' if number > 1 else ''}.html") for number in count(1))
+    free = (Path(f"{named(checkpoint).name}.evaluation{f'-{number}' if number > 1 else ''}.html") for number in count(1))
     return next(path for path in free if not os.path.lexists(path))
 
 
@@ -53,9 +52,8 @@ class AdaptationPage:
         """Raises now the errors that writing the page would raise: OutputExists and OutputError."""
         from mipmap_plugin.models.places import PAGE_ENDING
 
-        name = named(checkpoint).name
-        folder, self.of_one = targets[0].resolve().parent, len(targets) == 1
-        self.path = folder / f"{targets[0].resolve().name if self.of_one else f'{name}_adapted'}{PAGE_ENDING}"
+        name, target, self.of_one = named(checkpoint).name, named(targets[0]), len(targets) == 1
+        self.path = target.with_name(f"{target.name if self.of_one else f'{name}_adapted'}{PAGE_ENDING}")
         self._title, self._overwrite, self._zooms = name, overwrite, list[Any]()
         refuse_output(self.path, overwrite, is_file=True)
         refuse_unwritable(self.path)

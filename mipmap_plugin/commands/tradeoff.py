@@ -82,7 +82,7 @@ def tradeoff(
     folder, page = _outputs(output, picture, report, overwrite)
     plan = Plan(recipe or ("default", "paper"), steps, backend or ("auto",), supersampling or (2, 4, 8), renderers, repeats, seed, viewer)
     base = Base(checkpoint, cameras, background, screen_filter=screen_filter, up=up)
-    model, photographs = wrap(base, threads, images), scene(base, images) if images else None
+    model, photographs = wrap(base, threads), scene(base, images) if images else None
     _check(model, plan, scale)
     with resumable(output / KEPT, "cell"):
         tradeoffs = run(model, photographs, unique_scales(scale), plan, views, _with_page(folder, page, checkpoint, model))

@@ -16,6 +16,10 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import MAX_SCALE, MIN_SCALE
 from mipmap_plugin.screen_filters import TrainedName
 
+# What a size may end with, in bytes.
+UNITS = {"": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
+SIZE = re.compile(r"([0-9.]+)\s*([a-z]*)", re.IGNORECASE)
+
 
 def read_scale(text: str) -> float:
     """Parse a scale, such as 0.25, 1/4 or 4, or as pages and names of files write it, ×1/4 or x0.25. Raises ValueError."""
@@ -26,6 +30,18 @@ def read_scale(text: str) -> float:
     if not MIN_SCALE <= scale <= MAX_SCALE:
         raise ValueError(f"scale must be a number or a fraction from {MIN_SCALE:g} to {MAX_SCALE:g}, such as 1/4, 0.25 or 4, got {text}")
     return scale
+
+
+def read_size(text: str) -> int:
+    """The bytes of a size such as 20MB, 1.5 GB or 4000000. Raises SettingsError."""
+    found = SIZE.fullmatch(text.strip())
+    try:
+        size = int(float(found[1]) * UNITS[found[2].lower()]) if found else 0
+    except (ValueError, KeyError, OverflowError):
+        size = 0
+    if size < 1:
+        raise SettingsError(f"bytes: must be a size such as 20MB, got {text}")
+    return size
 
 
 def unique_scales(scales: Sequence[float]) -> list[float]:

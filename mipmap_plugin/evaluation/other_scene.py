@@ -18,7 +18,12 @@ ROUNDING = 4
 
 
 def of_another_scene(model: Wrapped, views: Sequence[TruthView], scale: float, protocol: Protocol) -> str:
-    """That the base does not show what the photographs do, in a sentence (`doubt_about`); "" if it does."""
+    """That the base does not show what the photographs do, in a sentence (`doubt_about`).
+
+    "" if it does, or if that was told of all photographs of its cameras already.
+    """
+    if model.doubted:
+        return ""
     truths = {view.camera: view for view in views}
     masks = ", whose transparent parts count as background" if any(isinstance(view, JudgedView) and view.transparent for view in views) else ""
     option, exposures = f"--images{masks}", model.model.traits.exposures

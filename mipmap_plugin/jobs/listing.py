@@ -58,12 +58,12 @@ def without_outputs(checkpoints: Iterable[Path]) -> tuple[list[Path], list[Path]
     kept: list[Path] = []
     left_out: list[Path] = []
     for path in checkpoints:
-        (left_out if is_output(path) else kept).append(path)
+        (left_out if _is_output(path) else kept).append(path)
     return kept, left_out
 
 
-def is_output(path: Path) -> bool:
-    """Whether an adaptation has made a file or folder."""
+def _is_output(path: Path) -> bool:
+    """Whether an adaptation has made a file, or a folder or what is in it."""
     from mipmap_plugin.models import detect
     from mipmap_plugin.models.outputs import is_adapted
     from mipmap_plugin.models.places import MANIFEST, PAGE_ENDING, PLAN, TILES

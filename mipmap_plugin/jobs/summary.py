@@ -12,6 +12,9 @@ from mipmap_plugin.jobs.job import Job, Outcome
 
 COLUMNS = ("checkpoint", "scale", "viewer", "outcome", "splats", "dB", "seconds", "file, or what is wrong")
 
+# How many jobs are named that warned of the same: thousands may, where no scene has cameras.
+NAMED = 5
+
 
 def in_order(outcomes: Iterable[Outcome], jobs: Sequence[Job]) -> list[Outcome]:
     """The outcomes in the order of the jobs; those of jobs that were never begun are missing."""
@@ -53,12 +56,12 @@ def totals(outcomes: Sequence[Outcome], count: int) -> str:
 
 
 def warned(outcomes: Iterable[Outcome]) -> list[str]:
-    """What jobs warned of, each warning once, behind the jobs that gave it."""
+    """What jobs warned of, each warning once, after the first of the jobs that gave it."""
     jobs = dict[str, list[str]]()
     for outcome in outcomes:
         for text in outcome.warnings:
             jobs.setdefault(text, []).append(str(outcome.job))
-    return [f"{', '.join(of)}: {text}" for text, of in jobs.items()]
+    return [f"{', '.join(of[:NAMED])}{f' and {len(of) - NAMED} more' * (len(of) > NAMED)}: {text}" for text, of in jobs.items()]
 
 
 def facts(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:

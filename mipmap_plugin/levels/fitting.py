@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
@@ -24,9 +23,6 @@ from mipmap_plugin.models.loaders import for_loader_of, wants_filter
 from mipmap_plugin.recipes import recipe, scale_of_fraction
 from mipmap_plugin.splatting.viewers import degree_for
 
-UNITS = {"": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
-SIZE = re.compile(r"([0-9.]+)\s*([a-z]*)", re.IGNORECASE)
-
 # Compressed files have a few percent more bytes per splat where splats are fewer.
 COMPRESSED_MARGIN = 0.9
 
@@ -42,18 +38,6 @@ ARCHIVE = 8192
 ANY_SCALE = 1 / 3
 
 ENDINGS = (*WRITTEN, ".ply")
-
-
-def read_size(text: str) -> int:
-    """The bytes of a size such as 20MB, 1.5 GB or 4000000. Raises SettingsError."""
-    found = SIZE.fullmatch(text.strip())
-    try:
-        size = int(float(found[1]) * UNITS[found[2].lower()]) if found else 0
-    except (ValueError, KeyError, OverflowError):
-        size = 0
-    if size < 1:
-        raise SettingsError(f"bytes: must be a size such as 20MB, got {text}")
-    return size
 
 
 def recorded(base: FrozenBase, requests: Sequence[tuple[float, str | None]], settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -44,7 +44,11 @@ def test_adapt_two_scales_into_a_folder(run, model_folder, tmp_path):
     assert not list(tmp_path.rglob("*.resume"))
 
 
-@pytest.mark.parametrize("words", ["", "--scale 1/2 --recipe mine", "--scale 1/2 --steps -1", "--scale 1/2 --viewer nobody", "--splats 9 --steps -1"])
+@pytest.mark.parametrize(
+    "words",
+    ["", "--scale 1/2 --recipe mine", "--scale 1/2 --steps -1", "--scale 1/2 --viewer nobody", "--splats 9 --steps -1",
+     "--splats 0", "--bytes 9parsecs"],
+)  # fmt: skip
 def test_what_is_wrong_whatever_the_checkpoint_is_said_before_it_is_read(run, model_folder, monkeypatch, words):
     """Reading a large one takes long."""
     monkeypatch.setattr("mipmap_plugin.commands.adapt.wrap", lambda *_: pytest.fail("it was read"))
@@ -55,9 +59,28 @@ def test_a_folder_that_is_given_for_a_file_is_not_offered_to_be_replaced(run, mo
     base = tiny.ply(tmp_path / "base.ply")
     said = f"{tmp_path} is a folder; give the path of what is to be written, such as {tmp_path / 'base_x0.5.ply'}"
     assert "--overwrite" not in refused(run("adapt", base, "--scale", "1/2", "--output", tmp_path), said)
+    assert run("adapt", base, "--scale", "1/2", "--output", tmp_path / "one" / "a.ply", *NO_STEP)[0] == 0
+    refused(run("adapt", base, "--scale", "1/2", "--output", tmp_path / "one"), "one is a folder; ")  # though an adaptation made all that is in it
     words = ["adapt", model_folder, "--scale", "1/2", "--output", tmp_path / "made", *NO_STEP]
     assert run(*words)[0] == 0
     refused(run(*words), "made exists already; pass --overwrite")
+
+
+def test_a_link_that_is_replaced_has_its_page_beside_it(run, tmp_path):
+    """The page lay beside what the link had led to, under that one's name."""
+    base, link, other = tiny.ply(tmp_path / "base.ply"), tmp_path / "made" / "link.ply", tmp_path / "other"
+    link.parent.mkdir()
+    other.mkdir()
+    link.symlink_to(tiny.ply(other / "a.ply"))
+    assert run("adapt", base, "--scale", "1/2", "--output", link, "--overwrite", "--report", *NO_STEP)[0] == 0
+    assert (link.parent / "link.ply.report.html").is_file() and [file.name for file in other.iterdir()] == ["a.ply"]
+
+
+def test_the_name_of_one_checkpoint_stands_in_paths_too(run, tmp_path):
+    """As with several: the scene was looked for in a folder {name}."""
+    tiny.scene(tmp_path / "data" / "base", train=tiny.cameras(3))
+    words = ["adapt", tiny.ply(tmp_path / "base.ply"), "--scale", "1/2", "--cameras", tmp_path / "data" / "{name}", *NO_STEP]
+    assert run(*words)[0] == 0
 
 
 def test_a_file_that_is_written_takes_no_memory_while_the_next_is_made(run, model_folder, tmp_path, monkeypatch):

@@ -48,10 +48,22 @@ def test_evaluate_tells_of_photographs_of_another_scene(tmp_path, capsys, seed, 
     assert (DOUBT in capsys.readouterr().err) == told
 
 
-def test_photographs_whose_cameras_are_given_too_are_told_of_once(tmp_path, capsys):
-    base, images = tiny.ply(tmp_path / "base.ply"), str(tiny.scene(tmp_path / "scene", tiny.cameras(4, seed=9, split="test"), seed=5))
-    assert main(["evaluate", str(base), "--images", images, "--cameras", images, "--scale", "1/2", "--no-report"]) == 0
+@pytest.mark.parametrize("words", ["evaluate --scale 1/2 --no-report", "adapt --scale 2 --steps 1"])
+def test_photographs_whose_cameras_are_given_too_are_told_of_once(tmp_path, capsys, words):
+    command, *more = words.split()
+    images = str(tiny.scene(tmp_path / "scene", tiny.cameras(4, seed=9, split="test"), tiny.cameras(4), seed=5))
+    assert main([command, str(tiny.ply(tmp_path / "base.ply")), "--images", images, "--cameras", images, *more]) == 0
     assert "".join(capsys.readouterr().err.split()).count("theymaybeofanotherscene") == 1
+
+
+@pytest.mark.parametrize("command", ["evaluate", "tradeoff"])
+def test_all_photographs_whose_cameras_are_given_are_looked_at(tmp_path, capsys, command):
+    """Not the judged ones alone, of which one has no others to be compared with."""
+    images = str(tiny.scene(tmp_path / "scene", tiny.cameras(1, split="test"), tiny.cameras(5, seed=9), seed=5))
+    quick = {"evaluate": ["--no-report", "--recipe", "instant"],
+             "tradeoff": ["--output", str(tmp_path / "out"), "--recipe", "instant", "--no-picture", "--no-renderers", "--repeats", "1"]}  # fmt: skip
+    assert main([command, str(tiny.ply(tmp_path / "base.ply")), "--images", images, "--cameras", images, "--scale", "1/2", *quick[command]]) == 0
+    assert "check --cameras" in " ".join(capsys.readouterr().err.split())
 
 
 def test_an_adapted_file_is_not_doubted_for_what_it_shows_at_another_scale(tmp_path, capsys):

@@ -15,6 +15,7 @@ from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Outcome
 from mipmap_plugin.jobs.listing import find_checkpoints, read_list, shard, without_outputs
 from mipmap_plugin.jobs.run import run as run_job
+from mipmap_plugin.jobs.summary import warned
 from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.wrap import Wrapped
 
@@ -51,6 +52,13 @@ def test_what_jobs_warn_of_is_told_of_each(run, tmp_path, monkeypatch, jobs):
     assert code == 0 and "mipmap-plugin: a.ply x0.5, b.ply x0.5: no cameras are known: " in err and err.count("no cameras") == 1
     told = json.loads(run(*words, "--overwrite", "--json")[1])
     assert all("no cameras are known" in each["warnings"][0] for each in told)
+
+
+def test_of_many_jobs_that_warn_of_the_same_a_few_are_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    outcomes = [Outcome(job_of(tmp_path, scale=1 / number), "done", warnings=("mind this",)) for number in range(1, 1001)]
+    assert warned(outcomes)[0].endswith(" x0.25, base.ply x0.2 and 995 more: mind this") and len(warned(outcomes)) == 1
+    assert warned(outcomes[:1]) == ["base.ply x1: mind this"]
 
 
 def test_a_quiet_batch_tells_what_failed_and_its_log_tells_all(run, tmp_path, monkeypatch):

@@ -8,9 +8,10 @@ import pytest
 import tiny
 
 from mipmap_plugin import cli, load_model
+from mipmap_plugin.commands.types import read_size
 from mipmap_plugin.errors import OutputError, SettingsError
 from mipmap_plugin.formats.ply import read_header
-from mipmap_plugin.levels.fitting import ARCHIVE, UNKNOWN, fitting_scale, read_size, recorded, splats_within
+from mipmap_plugin.levels.fitting import ARCHIVE, UNKNOWN, fitting_scale, recorded, splats_within
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.recipes import recipe, scale_of_fraction
 from mipmap_plugin.wrap import wrap_model

@@ -4,6 +4,7 @@ import pytest
 import tiny
 
 from mipmap_plugin.cli import main
+from mipmap_plugin.commands.pages import evaluation_page_path
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.adapted_name import adapted_name
 
@@ -25,6 +26,10 @@ def test_what_is_adapted_from_a_link_lies_beside_the_link_and_has_its_name(linke
     assert main(["adapt", str(linked / name), "--scale", "1/4", "--recipe", "instant"]) == 0
     assert len(load_model(linked / adapted)) == 60
     assert {path.name for path in (linked.parent / "blobs").iterdir()} == {"4fa1", "77c0"}
+
+
+def test_the_page_of_an_evaluation_has_the_name_of_a_link(linked):
+    assert evaluation_page_path(linked / "scene.ply", None).name == "scene.ply.evaluation.html"
 
 
 @pytest.mark.parametrize("given", [".", "point_cloud/.."])
