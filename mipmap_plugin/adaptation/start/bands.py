@@ -22,7 +22,8 @@ def with_more_bands(start: SplatModel, base: SplatModel, used: int, most: int, v
     if not isinstance(start, VanillaModel) or start.traits.placed:
         return start, used
     room = len(base.parameters()["means"]) * _numbers(used)
-    degree = max(used, *(each for each in range(most + 1) if len(start) * _numbers(degree_for(viewer, each)) <= room), 0)
+    fitting = [each for each in range(most + 1) if len(start) * _numbers(degree_for(viewer, each)) <= room]
+    degree = max([used, *fitting])
     return start.with_degree(degree) if degree > start.sh_degree else start, degree
 
 
