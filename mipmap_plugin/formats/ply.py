@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -143,8 +142,6 @@ def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Ite
             for name, column in columns.items():
                 rows[name] = column[start : start + WRITTEN_TOGETHER]
             file.write(rows.tobytes())
-        file.flush()
-        os.fsync(file.fileno())
     return path
 
 

@@ -3,6 +3,7 @@
 `.NAME.<slot>.tmp` contains `new` while an output is being written; `new` is discarded if its run is killed. A single file is moved into
 place by one rename, and a folder is exchanged with the old one, both atomically. If several steps are needed (a file and its companions,
 or a system that cannot exchange folders), `new` is first renamed to `ready`: from then on it is complete, and the next run finishes the moves.
+Before any of that everything in `new` is flushed to the disk, and after it the folder that it was moved to.
 `spent` names what the output was made from, such as the state of its run, which is removed when the output is in its place, and not before.
 """
 
@@ -63,6 +64,9 @@ class Staging:
     def commit(self) -> None:
         """Move what was written to `new` to its place, and remove what is spent with it. Raises OSError."""
         made = list(self.new.iterdir())
+        for folder, _, names in os.walk(self.new):
+            for path in (*(Path(folder, name) for name in names), Path(folder)):
+                _flush(path)
         kept = {self.place / each.name for each in made} | {*self.path.parents}
         spent = [path for path in self.spent if os.path.lexists(path) and path not in kept]
         if self.new / self.path.name in made:
@@ -78,6 +82,7 @@ class Staging:
             except OSError:
                 shutil.rmtree(ready, ignore_errors=True)
                 raise
+        _flush(self.place)
         for path in spent:
             _remove(path, self._folder)
 
@@ -149,6 +154,22 @@ def exchange(one: Path, other: Path) -> bool:
     if number in NO_EXCHANGE:
         return False
     raise OSError(number, os.strerror(number))
+
+
+def _flush(path: Path) -> None:
+    """Write a file, or the names in a folder, to the disk now: else a power cut may leave the new name without the bytes. Raises OSError."""
+    try:
+        # Windows flushes no file that is open for reading only, so that a read-only one is left as it is there, as are folders, and links anywhere.
+        opened = os.open(path, (os.O_RDWR if os.name == "nt" else os.O_RDONLY) | getattr(os, "O_NOFOLLOW", 0))
+    except OSError:
+        return
+    try:
+        os.fsync(opened)
+    except OSError:
+        if not path.is_dir():  # which some network disks do not flush
+            raise
+    finally:
+        os.close(opened)
 
 
 def _slots(path: Path) -> list[Path]:

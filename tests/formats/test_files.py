@@ -120,6 +120,21 @@ def test_an_output_appears_after_its_companions(tmp_path, monkeypatch):
     assert moved[-1] == "b" and sorted(moved) == ["a", "b", "c"]
 
 
+@pytest.mark.parametrize("write", [text, folder_of])
+def test_all_is_on_the_disk_before_it_gets_its_name_and_the_name_is_before_anything_else_goes(tmp_path, monkeypatch, write):
+    moved, flushed, calls = object(), os.fsync, []
+    for name, real in {"rename": os.rename, "replace": os.replace}.items():
+        monkeypatch.setattr(os, name, lambda *given, real=real: (calls.append(moved), real(*given)))
+    monkeypatch.setattr(os, "fsync", lambda opened: (calls.append(os.fstat(opened).st_ino), flushed(opened)))
+    (tmp_path / "state").touch()
+    with together(tmp_path / "out", [tmp_path / "state"]):
+        write(tmp_path / "out")
+    made = [tmp_path / "out", *(tmp_path / "out").rglob("*")]
+    first, *_, last = (number for number, call in enumerate(calls) if call is moved)
+    assert {path.stat().st_ino for path in made} <= set(calls[:first])
+    assert tmp_path.stat().st_ino in calls[first:last]
+
+
 def test_a_file_can_be_added_to_a_folder_that_is_being_made(tmp_path):
     folder_of(tmp_path / "a", "old")
     with together(tmp_path / "a"):
