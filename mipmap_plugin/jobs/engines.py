@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import queue
-import time
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
@@ -23,13 +22,9 @@ def in_this_process(jobs: Sequence[Job], threads: int | None = None) -> Generato
     from mipmap_plugin.jobs.run import run
 
     for job in jobs:
-        began = time.perf_counter()
-        try:
-            outcome = run(job, threads)
-        except KeyboardInterrupt as interrupt:
-            yield Outcome(job, "interrupted", reason=str(interrupt) or "interrupted", seconds=time.perf_counter() - began)
-            raise
-        yield outcome
+        yield (outcome := run(job, threads))
+        if outcome.status == "interrupted":
+            raise KeyboardInterrupt
 
 
 def in_workers(jobs: Sequence[Job], count: int, threads: int | None) -> Generator[Outcome, None, None]:

@@ -18,11 +18,14 @@ from mipmap_plugin.wrap import Wrapped
 
 
 def run(job: Job, threads: int | None = None) -> Outcome:
-    """Do a job; what is wrong with it becomes its outcome, warnings too. Interrupted, it raises KeyboardInterrupt, and goes on when run again."""
+    """Do a job; what is wrong with it becomes its outcome, warnings too. One that Ctrl-C interrupted goes on when it is run again."""
     began = time.perf_counter()
     with placed(job.settings.get("upsampler", ""), job.network), warnings.catch_warnings(record=True) as caught:
         hide_others_warnings()
-        outcome = _attempt(job, threads)
+        try:
+            outcome = _attempt(job, threads)
+        except KeyboardInterrupt as interrupt:
+            outcome = Outcome(job, "interrupted", reason=str(interrupt) or "interrupted")
     return replace(outcome, seconds=time.perf_counter() - began, warnings=tuple(told(each.message) for each in caught))
 
 

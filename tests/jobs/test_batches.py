@@ -3,14 +3,13 @@
 import json
 import os
 from pathlib import Path
-from unittest.mock import Mock
 
 import pytest
 import tiny
 from small_jobs import QUICK, job_of
 
 from mipmap_plugin.commands.many import Request, jobs_of
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, warn
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Outcome
 from mipmap_plugin.jobs.listing import find_checkpoints, read_list, shard, without_outputs
@@ -70,11 +69,16 @@ def test_a_quiet_batch_tells_what_failed_and_its_log_tells_all(run, tmp_path, mo
     assert log.index("a x0.5: done") < log.index("2 jobs: 1 done, 1 failed")
 
 
-def test_a_job_that_is_interrupted_in_this_process_is_in_the_table(run, scenes, monkeypatch):
+def test_a_job_that_is_interrupted_in_this_process_is_in_the_table_and_its_warnings_are_told(run, scenes, monkeypatch):
     """It was said not to have begun."""
-    monkeypatch.setattr(Wrapped, "adapt", Mock(side_effect=KeyboardInterrupt("interrupted at step 7")))
+
+    def interrupted(*_, **__):
+        warn("its state cannot be written")
+        raise KeyboardInterrupt("interrupted at step 7")
+
+    monkeypatch.setattr(Wrapped, "adapt", interrupted)
     code, out, err = run("adapt", scenes / "chair", scenes / "lego", "--scale", "1/2")
-    assert code == 130 and "chair x0.5: interrupted at step 7" in err
+    assert code == 130 and "chair x0.5: interrupted at step 7" in err and "chair x0.5: its state cannot be written\n" in err
     assert "  interrupted at step 7\n" in out and out.endswith("2 jobs: 1 interrupted, 1 not begun\n")
 
 

@@ -128,10 +128,7 @@ def test_an_interrupted_run_travels_with_its_states(tmp_path, changes, kept):
 
         with pytest.MonkeyPatch.context() as patched:
             patched.setattr("mipmap_plugin.adaptation.session.adapt", stopped)
-            try:
-                run_job(job)
-            except KeyboardInterrupt as interrupt:
-                return Outcome(job, "interrupted", reason=str(interrupt))
+            return run_job(job)
 
     delivery = do_parcel(pack(job), interrupted)
     outcomes = [unpack(delivery, job) for _ in range(2)]  # where the state of an earlier interruption lies, too
