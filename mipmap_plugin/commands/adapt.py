@@ -118,14 +118,14 @@ def adapt(
         jobs = _jobs(base, _limited(request, wrapped, jobs, size, fits=not scale))
     before = {} if overwrite or len(jobs) == 1 else finished_before(jobs, json)  # a single file is made or refused
     _check(wrapped, left := [job for job in jobs if job.target not in before])
-    page = AdaptationPage(checkpoints[0], [job.target for job in jobs], overwrite) if report else None
+    page = AdaptationPage(checkpoints[0], [job.target for job in jobs], overwrite, all_finished=not left) if report else None
     made = _made(wrapped, left, None if images is None else scene(base, images), page, json)
-    if page and not page.of_one:
+    if page and not page.of_one and not page.stays:
         page.write(made, [*before.values()])
     if json:
         print_json([before.get(job.target) or made.pop(0) for job in jobs])
     elif page:
-        say(look_at(page.path))
+        say(f"{look_at(page.path)}{', of an earlier command' * page.stays}")
 
 
 def _refuse_for_many(given: bool, scales: Sequence[float], size: str | None, page: bool) -> None:

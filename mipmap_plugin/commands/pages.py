@@ -48,15 +48,18 @@ def write_evaluation_page(
 class AdaptationPage:
     """The page of `adapt`: beside the one file, or in the folder of several."""
 
-    def __init__(self, checkpoint: Path, targets: Sequence[Path], overwrite: bool) -> None:
-        """Raises now the errors that writing the page would raise: OutputExists and OutputError."""
+    def __init__(self, checkpoint: Path, targets: Sequence[Path], overwrite: bool, *, all_finished: bool) -> None:
+        """Raises now the errors that writing the page would raise: OutputExists and OutputError. `all_finished`: no file is made, so that a page
+        that is there stays."""
         from mipmap_plugin.models.places import PAGE_ENDING
 
         name, target, self.of_one = named(checkpoint).name, named(targets[0]), len(targets) == 1
         self.path = target.with_name(f"{target.name if self.of_one else f'{name}_adapted'}{PAGE_ENDING}")
         self._title, self._overwrite, self._zooms = name, overwrite, list[Any]()
-        refuse_output(self.path, overwrite, is_file=True)
-        refuse_unwritable(self.path)
+        self.stays = all_finished and self.path.is_file()
+        if not self.stays:
+            refuse_output(self.path, overwrite, is_file=True)
+            refuse_unwritable(self.path)
 
     def add(self, base: Wrapped, adapted: Adapted) -> None:
         """Draw the pictures of an adapted file, as it is written."""

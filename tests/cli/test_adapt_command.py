@@ -190,6 +190,17 @@ def test_ctrl_c_between_two_files_and_the_same_command_goes_on(run, model_folder
     assert record["notes"][0] == "×1/4: an earlier command made it, and its pictures are not drawn again"
 
 
+def test_a_page_of_files_that_are_finished_stays(run, model_folder, tmp_path):
+    """Its being there was an error, and nothing was printed of the files."""
+    command = ["adapt", model_folder, "--scale", "1/4", "--scale", "1/2", "--output", tmp_path / "out", "--report", *NO_STEP]
+    made, again = run(*command), run(*command)
+    page = tmp_path / "out" / "base_adapted.report.html"
+    assert made[0] == again[0] == 0 and again[1].count("finished before\n") == 2 and again[1].endswith(f"page: {page}, of an earlier command\n")
+    (tmp_path / "out" / "base_x0.5").rename(tmp_path / "elsewhere")
+    code, _, told = run(*command)
+    assert code == 2 and f"{page} exists already" in told
+
+
 def test_adapt_to_the_bases_own_scale_gives_the_base(run, model_folder, tmp_path):
     code, out, err = run("adapt", model_folder, "--scale", "1", "--output", tmp_path / "same.ply", "--report")
     assert (code, err) == (0, "") and out.startswith("x1: holds the base as it is, 60 -> 60 splats, 0.0 s\n")

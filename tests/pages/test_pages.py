@@ -199,7 +199,6 @@ def test_the_page_of_adapt_has_the_figures_of_its_report(model_folder, tmp_path,
         base, adapted = zoom["pictures"][:2]
         assert base["mean"] == {"psnr_db": saved["validation"]["the base as it is"]}
         assert adapted["mean"]["psnr_db"] in saved["validation"].values() and adapted["view"]["psnr_db"] > 0
-    assert main(words) == 2
     assert main([*words, "--overwrite"]) == 0
 
 
