@@ -51,7 +51,7 @@ def choose_views(cameras: Sequence[Camera], viewpoints: Viewpoints, config: Adap
         raise SettingsError(f"there are no {split} views among the {plural(len(cameras), 'camera')}; use the view policy 'given'")
     if config.views == "jittered":
         extra = jittered(with_company(views, viewpoints.orbit), config.extra_views, generator)
-        return views + extra, f"{plural(len(views), 'train view')} and {len(extra)} around them"
+        return views + extra, f"{plural(len(views), 'train view')} and {len(extra)} around {'it' if len(views) == 1 else 'them'}"
     return views, f"the {plural(len(views), f'{split} view')}"
 
 

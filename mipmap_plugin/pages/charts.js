@@ -92,7 +92,7 @@ function curveChart(report) {
   for (const each of curve) {
     const what = each.step === 0 ? `${made ? made.replace("the start, ", "") : "the start"} (${before || "nothing before it"})`
       : `step ${each.step}${each.taken_back ? ", taken back" : ""}`;
-    const text = `${each.seconds.toFixed(2)} s: ${decibel(each.validation_db)}, ${grouped(each.gaussians)} splats, ${what}`;
+    const text = `${each.seconds.toFixed(2)} s: ${decibel(each.validation_db)}, ${splats(each.gaussians)}, ${what}`;
     const name = each.step === 0 ? "mark start" : each.taken_back ? "mark taken-back" : "mark";
     svg.append(point(place.x(each.seconds), place.y(each.validation_db), name, text, readout));
   }
@@ -136,7 +136,7 @@ function frontChart(scale, { cost, mark, label, unit, points }) {
   if (corners.length > 1) svg.append(draw("path", { class: "front", d: path(corners) }));
   for (const each of points) {
     const step = each.step == null ? "" : `, step ${each.step}`;
-    const text = `${each.name}${step}, ${each.backend}: ${decibel(each.psnr_db.median)}, ${digits(cost(each).median, 2)} ${unit}, ${grouped(each.gaussians)} splats`;
+    const text = `${each.name}${step}, ${each.backend}: ${decibel(each.psnr_db.median)}, ${digits(cost(each).median, 2)} ${unit}, ${splats(each.gaussians)}`;
     svg.append(point(place.x(cost(each).median), place.y(each.psnr_db.median), `mark ${each.kind}${each[mark] ? " on-front" : ""}`, text, readout));
   }
   return make("figure", { class: "chart" }, make("figcaption", {}, `${zoomName(scale.scale)}: dB over ${label}`), svg, readout);

@@ -30,6 +30,7 @@ const digits = (value, count) => (value == null ? "–" : value.toFixed(count));
 const zoomName = (scale) => (scale < 1 && Math.abs(1 / scale - Math.round(1 / scale)) < 1e-9 ? `×1/${Math.round(1 / scale)}` : `×${scale}`);
 
 const grouped = (value) => value.toLocaleString("en-US");
+const splats = (count) => `${grouped(count)} splat${count === 1 ? "" : "s"}`;
 
 /** PSNR, SSIM and LPIPS of a picture, as far as they were measured. */
 function qualityTexts(quality) {

@@ -20,7 +20,7 @@ function distanceAxis({ curve, levels, canvas }) {
   return {
     xLabel: "distance of what is nearest, world units", of, nameOf: String, rounded: roundedDistance, lines: [curve],
     switches: levels.slice(1).map((level) => level.distance_from).filter((each) => each >= ends[0] && each <= ends[1]),
-    xTicks: logTicks(...ends), what: (each) => `the levels (${grouped(Math.round(each.splats))} splats)`,
+    xTicks: logTicks(...ends), what: (each) => `the levels (${splats(Math.round(each.splats))})`,
   };
 }
 

@@ -186,8 +186,8 @@ def note_on_shapes(found: Sequence[str]) -> list[str]:
     if not any(found):
         return []
     others = [each for each in found if each]
-    cropped = "if they were cropped, every figure is of a distorted scene: give the cameras of the cropped ones"
-    return [f"the cameras of {plural(len(others), 'photograph')} are {STRETCHED} to their shape, as in 3DGS ({others[0]}); {cropped}"]
+    cropped = "if photographs were cropped, every figure is of a distorted scene: give the cameras of the cropped ones"
+    return [f"cameras are {STRETCHED} to the shape of {plural(len(others), 'photograph')}, as in 3DGS ({others[0]}); {cropped}"]
 
 
 def _too_far(stated: tuple[int, int], size: tuple[int, int]) -> bool:

@@ -104,6 +104,7 @@ def test_the_curve_has_a_mark_for_every_check_and_the_start(open_page: Open, tmp
     assert "closed form" in page.text_content("#curve .readout")
     assert f"{report['curve'][0]['validation_db']:.2f} dB" in page.text_content("#curve .readout")
     assert report["curve"][0]["validation_db"] not in report["validation"].values()  # the same state, but other views
+    assert page.evaluate("[1, 2000].map(splats)") == ["1 splat", "2,000 splats"]
     assert "of the validation views that steer the run; the base's line and the dB above are of the others" in page.text_content("#curve .note")
 
 

@@ -179,7 +179,7 @@ def test_photographs_of_a_folder_of_another_name_are_those_of_the_training(tmp_p
 def test_photographs_that_were_cropped_a_little_are_told_of_and_rounded_copies_are_not(tmp_path, size, told):
     write_text_model(tmp_path / "sparse/0", names(2))
     write_photographs(tmp_path / "images", names(2), size=size)
-    told_of = f"the cameras of 2 photographs are stretched to their shape, as in 3DGS (000.png has {size[0]} x {size[1]} px, its camera 64 x 48 px)"
+    told_of = f"cameras are stretched to the shape of 2 photographs, as in 3DGS (000.png has {size[0]} x {size[1]} px, its camera 64 x 48 px)"
     assert [note.partition(";")[0] for note in load_scene(tmp_path).warnings()] == [told_of] * told
 
 

@@ -61,7 +61,7 @@ def test_levels_and_tradeoffs_are_measured_to_its_sides_too():
 def test_the_adapted_file_is_seen_from_there_too(tmp_path):
     adapted = wrap_model(sharp(tmp_path / "photo.ply")).adapt(1 / 2, steps=1, extra_views=3)
     saved = adapted.save(tmp_path / "half.ply")
-    assert "1 train view and 3 around them" in json.loads((tmp_path / "half.ply.adaptation.json").read_text())["views"]
+    assert "1 train view and 3 around it" in json.loads((tmp_path / "half.ply.adaptation.json").read_text())["views"]
     [camera] = wrap_model(saved).cameras
     assert camera.fx == 40.0
 

@@ -228,7 +228,7 @@ def test_a_photograph_that_was_cropped_a_little_is_told_of(tmp_path):
     save_image(tmp_path / "train/r_0.png", 40, 28)
     scene = read_transforms(write_json(tmp_path / "transforms.json", {"camera_angle_x": 0.8, "w": 40, "h": 30, "frames": [frame()]}))
     [note] = scene.warnings()
-    assert "stretched to their shape, as in 3DGS (r_0.png has 40 x 28 px, its camera 40 x 30 px); if they were cropped, every figure is" in note
+    assert "stretched to the shape of 1 photograph, as in 3DGS (r_0.png has 40 x 28 px, its camera 40 x 30 px); if photographs were cropped" in note
 
 
 def test_numbers_of_a_lens_may_be_texts(tmp_path):
