@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import glob
 from collections.abc import Iterable, Sequence
+from os.path import realpath  # of a link to itself too, at which `Path.resolve` fails
 from pathlib import Path
 from typing import TypeVar
 
@@ -58,7 +59,7 @@ def without_outputs(checkpoints: Iterable[Path]) -> tuple[list[Path], list[Path]
     kept: list[Path] = []
     left_out: list[Path] = []
     for path in checkpoints:
-        (left_out if _is_output(path) else kept).append(path)
+        (left_out if _is_output(path) or _is_output(Path(realpath(path))) else kept).append(path)  # a link has no report beside it
     return kept, left_out
 
 

@@ -280,10 +280,12 @@ def test_files_that_adaptations_leave_are_left_out(tmp_path):
     for folder, file in {"ladder": "levels.json", "tiled.tiles": "plan.json"}.items():
         (tmp_path / folder).mkdir()
         (tmp_path / folder / file).write_text("{}")
+    (tmp_path / "link.ply").symlink_to("out.ply")
+    (tmp_path / "link of base.ply").symlink_to("base.ply")
     kept, left_out = without_outputs(sorted(tmp_path.iterdir()))
-    assert kept == [tmp_path / "base.ply", tmp_path / "cameras.json"]
+    assert kept == [tmp_path / "base.ply", tmp_path / "cameras.json", tmp_path / "link of base.ply"]
     beside = {f"out.ply.{ending}" for ending in ("adaptation.json", "report.html", "resume")}
-    assert {path.name for path in left_out} == {"ladder", "out.ply", "tiled.tiles"} | beside
+    assert {path.name for path in left_out} == {"ladder", "link.ply", "out.ply", "tiled.tiles"} | beside
 
 
 def test_a_list_of_another_editor_is_read_and_an_empty_one_is_named(tmp_path):
