@@ -36,7 +36,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance.ladder import scene_of
 from mipmap_plugin.levels.distance.mixture import Mixture
 from mipmap_plugin.levels.distance.rule import DistanceRule
-from mipmap_plugin.levels.distance.scene import Scene
+from mipmap_plugin.levels.distance.scene import DistanceScene
 from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground
 from mipmap_plugin.levels.manifest import CANVAS, MANIFEST
 from mipmap_plugin.levels.request import LadderRequest
@@ -96,7 +96,7 @@ class Walk:
     truths: list[Tensor]
 
 
-def walks(scene: Scene) -> list[Walk]:
+def walks(scene: DistanceScene) -> list[Walk]:
     truth = WalkTruth((scene.splats, scene.backend, scene.base.effects()), scene.views, {}, SAMPLES)
     found = []
     for view in jittered(scene.views, WALKS, torch.Generator().manual_seed(SEED)):
@@ -111,7 +111,7 @@ def scales() -> list[float]:
 
 
 @torch.no_grad()
-def film(scene: Scene, name: str, mixture: Mixture, walked: Sequence[Walk]) -> Film:
+def film(scene: DistanceScene, name: str, mixture: Mixture, walked: Sequence[Walk]) -> Film:
     """Measure every frame of all walks."""
     columns = [_walked(scene, mixture, walk) for walk in walked]
     frames = []
@@ -121,7 +121,7 @@ def film(scene: Scene, name: str, mixture: Mixture, walked: Sequence[Walk]) -> F
     return Film(name, [len(level) for level in mixture.levels], frames)
 
 
-def _walked(scene: Scene, mixture: Mixture, walk: Walk) -> list[tuple[float | None, ...]]:
+def _walked(scene: DistanceScene, mixture: Mixture, walk: Walk) -> list[tuple[float | None, ...]]:
     """PSNR, flicker, splats, switches and likeness of each frame of one walk."""
     rows: list[tuple[float | None, ...]] = []
     wrong_before: Tensor | None = None
@@ -137,11 +137,11 @@ def _walked(scene: Scene, mixture: Mixture, walk: Walk) -> list[tuple[float | No
     return rows
 
 
-def draw(scene: Scene, splats: Gaussians, camera: Camera) -> Tensor:
+def draw(scene: DistanceScene, splats: Gaussians, camera: Camera) -> Tensor:
     return scene.backend.render(splats, camera, scene.target).image.clamp(0, 1)
 
 
-def mixture_of(scene: Scene, folder: Path) -> Mixture:
+def mixture_of(scene: DistanceScene, folder: Path) -> Mixture:
     """The levels of a ladder and PlayCanvas's rule with the distances that are closest to its switches."""
     manifest = json.loads((folder / MANIFEST).read_text())
     base_distance, multiplier = progression(distances(manifest, CANVAS), 2.0)
@@ -149,11 +149,11 @@ def mixture_of(scene: Scene, folder: Path) -> Mixture:
     return Mixture.of(rule, scene.chunks, [splats_of(scene, folder / level["file"]) for level in manifest["levels"]])
 
 
-def splats_of(scene: Scene, file: Path) -> Gaussians:
+def splats_of(scene: DistanceScene, file: Path) -> Gaussians:
     return load_model(file).gaussians(scene.base.any_camera()).detach()
 
 
-def mixtures(scene: Scene, base: Wrapped, ladders: Path, name: str, folder: Path) -> dict[str, Mixture]:
+def mixtures(scene: DistanceScene, base: Wrapped, ladders: Path, name: str, folder: Path) -> dict[str, Mixture]:
     """All ways to show the scene."""
     ours, by_zoom = (
         mixture_of(scene, ladder_of(base, VIEWER, ladders / f"{name}_{VIEWER}_{by}", coarsest=COARSEST, by=by)) for by in ("distance", "zoom")

@@ -17,7 +17,7 @@ from mipmap_plugin.levels.distance.chunks import LEAST_OF_BASE, Chunks
 from mipmap_plugin.levels.distance.level import AS_FINER, LevelRun
 from mipmap_plugin.levels.distance.manifest import DistanceContents, manifest
 from mipmap_plugin.levels.distance.rule import DistanceRule, is_unbounded, nearest
-from mipmap_plugin.levels.distance.scene import Scene
+from mipmap_plugin.levels.distance.scene import DistanceScene
 from mipmap_plugin.levels.distance.walks import focal_of, foreground
 from mipmap_plugin.levels.distance.yardstick import measured
 from mipmap_plugin.levels.finished import Ladder
@@ -57,7 +57,7 @@ def make_levels_by_distance(base: FrozenBase, request: LadderRequest, resume: Pa
     return Ladder(DistanceContents(scene, levels, curve, left_out), store, manifest)
 
 
-def without_repeats(scene: Scene, levels: list[Adapted]) -> tuple[Scene, list[Adapted], list[LeftOut]]:
+def without_repeats(scene: DistanceScene, levels: list[Adapted]) -> tuple[DistanceScene, list[Adapted], list[LeftOut]]:
     """A ladder without the levels at its end that are the finer one again, which a viewer shows in their place: the same picture, at fewer bytes.
 
     One before another level stays: the distances at which a viewer changes are in a fixed proportion, so that each level needs the one before.
@@ -93,7 +93,7 @@ def refuse(base: FrozenBase, request: LadderRequest) -> None:
         raise SettingsError(f"{', '.join(sorted(taken))}: levels by distance have as many splats as their distances need; leave out")
 
 
-def scene_of(base: FrozenBase, request: LadderRequest, band: Band) -> Scene:
+def scene_of(base: FrozenBase, request: LadderRequest, band: Band) -> DistanceScene:
     """The rule and the chunks that suit a base. Raises BackendUnavailable."""
     backend, note = base.backend(gradients=True, viewer=request.viewer)
     with torch.no_grad():
@@ -101,7 +101,7 @@ def scene_of(base: FrozenBase, request: LadderRequest, band: Band) -> Scene:
         pixels = seen_pixel_size(splats.means, views, base.effects().near_plane)
         rule = DistanceRule.of(pixels, request, band)
         extent = chunk_extent(nearest(pixels) * focal_of(views[0]))
-        return Scene(base, request, rule, Chunks.of(splats, extent, LEAST_OF_BASE), extent, base.target(request.viewer), backend, note)
+        return DistanceScene(base, request, rule, Chunks.of(splats, extent, LEAST_OF_BASE), extent, base.target(request.viewer), backend, note)
 
 
 def chunk_extent(distance: float) -> int:

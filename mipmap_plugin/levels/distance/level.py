@@ -34,7 +34,7 @@ from mipmap_plugin.effects import explain
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance.coarsening import coarsened, kept_splats
 from mipmap_plugin.levels.distance.mixture import Mixture
-from mipmap_plugin.levels.distance.scene import Scene
+from mipmap_plugin.levels.distance.scene import DistanceScene
 from mipmap_plugin.levels.distance.walks import WalkTruth
 from mipmap_plugin.levels.request import MERGING_COSTS
 from mipmap_plugin.models.base import SplatModel, digest_of_model, digest_of_parameters, effects_of
@@ -67,7 +67,7 @@ class WalkTask(Task):
 class LevelRun:
     """The making of one level below the first."""
 
-    scene: Scene
+    scene: DistanceScene
     number: int
     finer: Sequence[SplatModel]  # all levels before it
     seconds: dict[str, float] = field(default_factory=lambda: {"optimization": 0.0})

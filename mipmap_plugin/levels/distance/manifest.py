@@ -11,7 +11,7 @@ from typing import Any
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.contents import LeftOut
-from mipmap_plugin.levels.distance.scene import Scene
+from mipmap_plugin.levels.distance.scene import DistanceScene
 from mipmap_plugin.levels.distance.yardstick import TRUTH, WalkPoint
 from mipmap_plugin.levels.manifest import CANVAS, FORMAT, file_facts
 
@@ -20,7 +20,7 @@ from mipmap_plugin.levels.manifest import CANVAS, FORMAT, file_facts
 class DistanceContents:
     """Levels from the finest to the coarsest, and how good they are on walks."""
 
-    scene: Scene
+    scene: DistanceScene
     levels: list[Adapted]
     curve: list[WalkPoint]
     left_out: Sequence[LeftOut]  # beyond the last level, by falling scale

@@ -33,7 +33,7 @@ BELOW_1 = 1 - 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class DistanceScene:
     """What all levels of a ladder by distance share."""
 
     base: FrozenBase

@@ -15,7 +15,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance.mixture import Mixture
 from mipmap_plugin.levels.distance.rule import DistanceRule
-from mipmap_plugin.levels.distance.scene import Scene
+from mipmap_plugin.levels.distance.scene import DistanceScene
 from mipmap_plugin.levels.distance.walks import WalkTruth, backed, focal_of, foreground
 from mipmap_plugin.levels.yardstick import DRAW, VIEWS
 from mipmap_plugin.limits import derived_seed
@@ -60,7 +60,7 @@ class Seen:
 class Walks:
     """Random walks backwards over levels."""
 
-    def __init__(self, scene: Scene, levels: Sequence[SplatModel]) -> None:
+    def __init__(self, scene: DistanceScene, levels: Sequence[SplatModel]) -> None:
         generator = torch.Generator().manual_seed(derived_seed(int(scene.request.settings.get("seed", 0)), DRAW))
         around = with_company(scene.views, scene.base.viewpoints.orbit)
         seeing = [view for view in (*jittered(around, VIEWS, generator), *scene.views) if math.isfinite(self._depth(view, scene))]
@@ -89,7 +89,7 @@ class Walks:
         return max(0.0, size * focal_of(view) - self._depth(view, self._scene))
 
     @staticmethod
-    def _depth(view: Camera, scene: Scene) -> float:
+    def _depth(view: Camera, scene: DistanceScene) -> float:
         return foreground(view, scene.splats.means, scene.target.near_plane)
 
     def _draw(self, splats: Gaussians, camera: Camera) -> Tensor:
@@ -101,7 +101,7 @@ def sizes(rule: DistanceRule) -> list[float]:
     return [size for number in range(rule.count + rule.left_out) for size in (rule.middle(number), rule.ends(number)[1] * WITHIN)]
 
 
-def measured(scene: Scene, levels: Sequence[SplatModel]) -> list[WalkPoint]:
+def measured(scene: DistanceScene, levels: Sequence[SplatModel]) -> list[WalkPoint]:
     """The quality at all places of the walks, in their order."""
     walks, points = Walks(scene, levels), []
     for size in walks.sizes():
