@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.adaptation.curve import CurvePoint
+from mipmap_plugin.adaptation.in_viewers import better_as_trained
 from mipmap_plugin.adaptation.optimization.amount import fewer_note
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.validation import Quality, last_of_best
@@ -34,6 +35,7 @@ class Judgment:
     validation: dict[str, float]  # dB
     returned: str  # the name of the best, or of the last where the settings say so
     notes: list[str]  # what there is to say of splats and views, in sentences
+    as_trained: float | None = None  # dB of the base as its training drew it; None where the target draws so too
 
 
 def judged(scene: TiledScene) -> Judgment:
@@ -47,11 +49,16 @@ def judged(scene: TiledScene) -> Judgment:
     errors = {name: errors_of(scene, splats, truths, views) for name, splats in states.items()}
     found = {name: Quality.of([each]) for name, each in errors.items()}
     validation = {name: each.psnr for name, each in found.items()}
-    if scene.config.returns == "last":
-        return Judgment(validation, JOINED, start["notes"])
-    best = last_of_best({name: each.visible for name, each in found.items()}, AS_IT_IS)
-    before, after = ([Quality.of([[error]]).visible for error in errors[name]] for name in (AS_IT_IS, best))
-    return Judgment(validation, best, [*start["notes"], *worse_views(views, before, after, scene.scale)])
+    as_trained = None
+    if scene.base_effects != scene.target:
+        as_trained = Quality.of([errors_of(scene, scene.base, truths, views, scene.base_effects)]).psnr
+    best, worse = JOINED, list[str]()
+    if scene.config.returns == "best":
+        best = last_of_best({name: each.visible for name, each in found.items()}, AS_IT_IS)
+        before, after = ([Quality.of([[error]]).visible for error in errors[name]] for name in (AS_IT_IS, best))
+        worse = worse_views(views, before, after, scene.scale)
+    better = better_as_trained(as_trained, validation[best], scene.base_effects)
+    return Judgment(validation, best, [*start["notes"], *worse, *better], as_trained)
 
 
 def make_report(
@@ -88,6 +95,7 @@ def make_report(
         ended_by=_ended_by(scene, tiles, f"{plural(len(files), 'tile')} of {plural(steps, 'step')}"),
         returned=judgment.returned,
         validation=judgment.validation,
+        as_trained=judgment.as_trained,
         curve=[CurvePoint(step=steps, seconds=seconds["total"], validation_db=db, gaussians=after)],
         versions=versions(),
         notes=[*scene.doubts, *judgment.notes, *lost],

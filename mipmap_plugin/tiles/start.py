@@ -20,6 +20,7 @@ from mipmap_plugin.adaptation.start.matching import matched_opacities
 from mipmap_plugin.adaptation.start.merging import merge_down, merge_seen
 from mipmap_plugin.adaptation.start.strength import Bounds, Candidate, Costs, Merger
 from mipmap_plugin.camera import Camera, evenly
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.process import pool
@@ -187,8 +188,9 @@ def quality(scene: TiledScene, splats: Splats, truths: Truths) -> Quality:
 
 
 @torch.no_grad()
-def errors_of(scene: TiledScene, splats: Splats, truths: Truths, views: Sequence[Camera]) -> list[float]:
-    """The mean square error of each view of splats as the target shows them, of images and truths clamped as a display does, as without tiles."""
-    painter = scene.painter(scene.target)
+def errors_of(scene: TiledScene, splats: Splats, truths: Truths, views: Sequence[Camera], effects: Effects | None = None) -> list[float]:
+    """The mean square error of each view of splats as the target, or a renderer with these `effects`, shows them, as without tiles: of images and
+    truths clamped as a display does."""
+    painter = scene.painter(effects or scene.target)
     images = ((painter.image(splats, view.zoomed(scene.scale)), truths[view.name]) for view in views)
     return [float((image.clamp(0, 1) - truth.clamp(0, 1)).square().mean()) for image, truth in images]

@@ -36,6 +36,7 @@ from mipmap_plugin.tiles import plan, run
 from mipmap_plugin.tiles.reading import make_cut
 from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
 from mipmap_plugin.tiles.truth import Truths
+from mipmap_plugin.wrap import wrap_model
 
 # The whole
 
@@ -70,6 +71,28 @@ def test_views_that_look_worse_than_the_base_are_told_of_in_tiles_too(tmp_path):
     with pytest.warns(UserWarning, match="the file for x0.25 looks worse than the base"):
         report = adapt_in_tiles(job, 2).report
     assert any("the file for x0.25 looks worse than the base" in note for note in report.notes)
+
+
+def test_a_viewer_that_suits_a_scene_less_than_its_own_renderer_does_is_told_of_in_tiles_too(job, tmp_path):
+    views, own = tiny.cameras(3, width=20, height=16), TrainedScale("mip", 0.1)
+    shown = replace(job, base=Base(tiny.folder(tmp_path / "mip", views, count=80, trained=own)), scale=0.9, viewer="antimatter15")
+    settings = {"views": "given", "validation_views": 2, "closed_form": False, "steps": 0, "merge_to": 1.0, "returns": "last"}
+    with pytest.warns(UserWarning, match="drawn as its training drew it"):
+        report = adapt_in_tiles(replace(shown, settings=settings), 2).report
+    whole = wrap_model(shown.base.checkpoint).adapt(0.9, viewer="antimatter15", **settings).report
+    assert report.as_trained == pytest.approx(whole.as_trained, abs=0.01) and report.as_trained > report.psnr_after()
+    assert [note for note in report.notes if "the base itself has" in note] and [note for note in whole.notes if "the base itself has" in note]
+
+
+def test_a_viewer_that_rounds_the_positions_of_a_scene_far_out_is_told_of_in_tiles_too(job, tmp_path):
+    there, views = tiny.gaussians(80), tiny.cameras(3, width=20, height=16)
+    away = torch.tensor([1e6, 0.0, 0.0])
+    VanillaModel.from_gaussians(replace(there, means=there.means + away)).save(tmp_path / "far.ply", provenance={})
+    moved = [view.looking_from(viewmat_of(view.viewmat[:3, :3].mT, view.center + away.double()), view.name) for view in views]
+    write_cameras(tmp_path / "far.json", moved)
+    far = replace(job, base=Base(tmp_path / "far.ply", tmp_path / "far.json"), viewer="spark", settings=job.settings | {"steps": 0})
+    with pytest.warns(UserWarning, match="spark keeps positions in 16 bits"):
+        adapt_in_tiles(far, 2)
 
 
 def test_a_large_scene_takes_fewer_steps_in_tiles_too(job, monkeypatch):
