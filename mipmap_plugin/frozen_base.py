@@ -70,6 +70,7 @@ class FrozenBase:
         self.loading_s = 0.0  # seconds that loading the model took
         self.asked: dict[str, str] = {}  # what was given beside the checkpoint (`Report.inputs`); "" for what was not
         self.cameras_from: dict[str, str] = {}  # where its cameras were read from (`Report.cameras_from`)
+        self.compared = set[tuple[Path, bytes]]()  # the photographs that it was compared with (`Scene.photographed`)
         self.images: BaseImages | None = None  # of the base, drawn so far for all scales; None: the next call draws all of its own
         self.keeps_images = True  # for further scales, up to 1 GiB; False saves that memory where `adapt` is called once
 
@@ -133,8 +134,7 @@ class FrozenBase:
         [camera], outputs = checked([camera]), as_outputs(options.get("outputs"))
         check_names("render", options, RenderOptions, ("scale", "screen_filter", "supersampling"))
         viewer, exposure = options.get("viewer"), options.get("exposure", False)
-        scale = check_scale(scale)
-        effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=outputs, exposure=exposure)
+        effects = replace(self.effects(check_scale(scale), screen_filter, supersampling, viewer), outputs=outputs, exposure=exposure)
         check_image(camera.width * supersampling, camera.height * supersampling, self.model.parameters()["means"].device)
         backend, _ = self.backend(screen_filter=screen_filter, viewer=viewer)
         form = self._smoothed if options.get("filter_3d") else None
@@ -193,7 +193,7 @@ class FrozenBase:
         inputs = self.asked | views | ({"photographs": scene.digest()} if scene else {}) | network_input(config.upsampler)
         photographs = Photographs(there, self.cameras, self.background) if there else None
         if photographs:
-            photographs.warn_of_others(self.render)
+            photographs.warn_of_others(self.render, self.compared)
         cameras = (photographs or self).cameras if cameras is None else cameras
         needs = [replace(self._needs, screen_filter=target.screen_filter, settings=target.settings) for target in targets.values()]
         backend, note, has_gradients = choose(self._backend, config, needs, self._needs)

@@ -166,6 +166,7 @@ def _of_unknown_size(model: SplatModel, scene: Scene) -> str:
 def warn_of_others(wrapped: Wrapped, scene: Scene, render: Callable[..., Rendered]) -> None:
     """Warn if the photographs of the scene whose cameras are given, in the model's frame, do not show what it does, as drawn by `render`."""
     color, exposures = wrapped.background, wrapped.model.traits.exposures
+    wrapped.compared |= scene.photographed()
     try:
         doubt = doubt_about([*scene.images], lambda camera: scene.image(camera, color, LOOK), render, color, "--cameras", exposures)
     except MipmapPluginError:  # such as a damaged photograph, which cameras do without

@@ -70,6 +70,10 @@ class Scene:
         sizes = [(path.name, path.stat().st_size) for path in self.images.values()]
         return hashlib.sha256(f"{digest_of(self.cameras)} {sizes}".encode()).hexdigest()[:DIGITS]
 
+    def photographed(self) -> set[tuple[Path, bytes]]:
+        """The photographs, each with the pose that it was taken from."""
+        return {(path, camera.viewmat.numpy().tobytes()) for camera, path in self.images.items()}
+
     @property
     def is_capture(self) -> bool:
         """Whether it is what a scene was trained on, and not the cameras.json of a checkpoint."""

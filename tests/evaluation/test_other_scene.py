@@ -56,6 +56,18 @@ def test_photographs_whose_cameras_are_given_too_are_told_of_once(tmp_path, caps
     assert "".join(capsys.readouterr().err.split()).count("theymaybeofanotherscene") == 1
 
 
+def test_a_base_is_compared_with_the_same_photographs_once(tmp_path, recwarn):
+    """Not for their cameras, and again at every scale."""
+    images = tiny.scene(tmp_path / "scene", tiny.cameras(4, seed=9, split="test"), tiny.cameras(4), seed=5)
+    base = wrap_model(tiny.ply(tmp_path / "base.ply"), cameras=images)
+    for scale in (2, 4):
+        base.adapt(scale, images=images, steps=1)
+    others = tiny.scene(tmp_path / "others", tiny.cameras(4, seed=9, split="test"), tiny.cameras(4), seed=6)
+    base.adapt(2, images=others, steps=1)
+    told = [str(warning.message) for warning in recwarn if "they may be of another scene" in str(warning.message)]
+    assert ["check --cameras" in text for text in told] == [True, False]
+
+
 @pytest.mark.parametrize("command", ["evaluate", "tradeoff"])
 def test_all_photographs_whose_cameras_are_given_are_looked_at(tmp_path, capsys, command):
     """Not the judged ones alone, of which one has no others to be compared with."""

@@ -60,8 +60,11 @@ class Photographs:
             raise SettingsError("none of the views that are adapted to has a photograph: take the train views, or leave the images out")
         return f"{count} of them real images"
 
-    def warn_of_others(self, render: Callable[..., Rendered]) -> None:
-        """Warn if the base, by its `render`, does not show what they do (`doubt_about`)."""
+    def warn_of_others(self, render: Callable[..., Rendered], compared: set[tuple[Path, bytes]]) -> None:
+        """Warn if the base, by its `render`, does not show what they do (`doubt_about`), unless it was `compared` with them; that is noted there."""
+        if self._scene.photographed() <= compared:
+            return
+        compared |= self._scene.photographed()
         scene, color, originals = self._scene, self._background, self._originals
         if doubt := doubt_about(self.cameras, lambda view: scene.image(originals[view], color, LOOK), render, color, "--images"):
             warn(doubt)
