@@ -60,6 +60,9 @@ LONGER = 2.0
 # What to do about lenses that no single file fits.
 EACH_LENS = "adapt with the cameras of each lens on their own"
 
+# What is said where most cameras see nothing.
+MISFIT = "; so many may be of another scene, or in other coordinates: give those of this one, unless it was cut down"
+
 # How far a splat is visible, in standard deviations; and the distance that views of an orbit keep from a scene, in near planes.
 SEEN, CLEAR = 3, 2
 
@@ -94,7 +97,8 @@ def seeing(cameras: Sequence[Camera], means: Tensor, near: float) -> list[Camera
     blind = len(cameras) - len(kept)
     if not blind or not any(camera.split == "train" for camera in kept):
         return list(cameras)
-    warn(f"{blind} of {len(cameras)} cameras {'sees' if blind == 1 else 'see'} no splat, or hardly any, and {'is' if blind == 1 else 'are'} left out")
+    told = f"{some_of(blind, len(cameras), 'camera', 'see')} no splat, or hardly any, and {'is' if blind == 1 else 'are'} left out"
+    warn(told + (MISFIT if blind > len(cameras) / 2 else ""))
     return kept
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import base_cameras, print_facts, print_json
 from mipmap_plugin.commands.types import Cameras, Checkpoint, ScreenFilter, Up
-from mipmap_plugin.errors import PluginError, plural
+from mipmap_plugin.errors import PluginError, SettingsError, plural
 from mipmap_plugin.formats.here import typed
 from mipmap_plugin.jobs.base import COLORS
 from mipmap_plugin.process.garbage import uncollected
@@ -85,6 +85,10 @@ def _facts(checkpoint: Path, wrapped: Wrapped, given: Path | None, *, whole: boo
         effects = explain(wrapped.effects(), gaussians, effects_of(model))
         off = sum(not effect.on for effect in effects)
         lost = remarks(wrapped.views(), model, wrapped.effects().near_plane, orbit=not wrapped.cameras)
+        try:
+            wrapped.refuse_undrawn()
+        except SettingsError as error:  # which adapting would raise
+            lost = [*dict.fromkeys([str(error), *lost])]
         told = [*health.sentences(), *lost, *filter(None, [too_unlike(wrapped.views())])]
     return {
         "verdict": _verdict(wrapped, _advice(wrapped, checkpoint, given), told, bool(lost) or health.spoilt(), health.mostly_unseen()),

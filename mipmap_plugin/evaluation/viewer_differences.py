@@ -6,11 +6,12 @@ from statistics import fmean
 
 import torch
 
+from mipmap_plugin.adaptation.shown import seeing
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.errors import plural
 from mipmap_plugin.evaluation.metrics import SAME_DB, psnr
 from mipmap_plugin.models.adapted_scale import adapted_scale
-from mipmap_plugin.models.base import why_no_viewer
+from mipmap_plugin.models.base import places, why_no_viewer
 from mipmap_plugin.wrap import Wrapped
 
 VIEWERS = ("spark", "playcanvas", "gaussian-splats-3d", "classic", "antialiased")
@@ -33,13 +34,16 @@ def viewer_differences(wrapped: Wrapped) -> str:
         return "not drawn: its own project alone opens such a file; `mipmap-plugin adapt --scale 1 --viewer NAME --output NEW.ply` makes another"
     if "reference" in (wrapped.backend()[0].name, wrapped.backend(viewer=VIEWERS[0])[0].name):
         return "not drawn: only the reference backend can, which takes too long; `mipmap-plugin backends` says what others lack"
-    views = [view.zoomed(scale) for view in wrapped.views()]
+    cameras = wrapped.views()
+    views = [view.zoomed(scale) for view in seeing(cameras, places(model, cameras[0]), wrapped.effects().near_plane)]
     count, pixels = len(model.gaussians(views[0])), views[0].width * views[0].height
     view_count = min(VIEWS, len(views), SPLATS // max(1, count), PIXELS // pixels)
     if view_count == 0:
         return f"not drawn: {plural(count, 'splat')} on {plural(pixels, 'pixel')} take too long; `mipmap-plugin render --viewer NAME` draws them"
     chosen = evenly(views, view_count)
     truths = [wrapped.render(view, scale).image for view in chosen]
+    if all(torch.equal(truth, truth[:1, :1].expand_as(truth)) for truth in truths):
+        return f"not compared: there is nothing in {plural(view_count, 'view')} of its cameras"
     parts = []
     for viewer in VIEWERS:
         mean_psnr = fmean(psnr(wrapped.render(view, scale, viewer=viewer).image, truth) for view, truth in zip(chosen, truths, strict=True))

@@ -3,11 +3,13 @@
 import json
 import re
 import shlex
+from dataclasses import replace
 
 import anchor_checkpoints
 import numpy as np
 import pytest
 import tiny
+import torch
 from commands_run import NO_STEP, refused
 
 from mipmap_plugin.backends import BACKENDS
@@ -127,6 +129,16 @@ def test_inspect_sees_a_lone_file_by_given_cameras(run, model_folder, tmp_path):
     assert "\ncameras:      4, 32 x 24 px, " in out and f"adapt {ply} --scale 1/4 --cameras {cameras}\n" in out
     code, _, err = run("inspect", ply, "--cameras", tmp_path / "none.json")
     assert code == 2 and "none.json: there is no such file" in err
+
+
+def test_cameras_that_see_nothing_of_a_lone_file_make_it_doubtful(run, tmp_path):
+    """Viewers were said to be the same."""
+    back = torch.diag(torch.tensor([-1.0, 1, -1, 1], dtype=torch.float64))
+    turned = [replace(camera, viewmat=back @ camera.viewmat) for camera in tiny.cameras(3)]
+    write_cameras(tmp_path / "others.json", turned)
+    _, out, _ = run("inspect", tiny.ply(tmp_path / "a.ply"), "--cameras", tmp_path / "others.json")
+    assert "doubtful: read health before you adapt it" in out and "none of 3 views shows a splat: the cameras seem to be of another scene" in out
+    assert re.search(r"\nviewers: +not compared: there is nothing in 3 views of its cameras\n", out)
 
 
 def test_inspect_says_how_far_viewers_are_from_training(run, model_folder):
