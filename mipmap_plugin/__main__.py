@@ -2,13 +2,17 @@
 
 import signal
 import sys
+import time
 
 
 def run() -> int:
     """Run the command of this process, and return the exit code."""
+    began = time.monotonic()
     try:
+        from mipmap_plugin import progress
         from mipmap_plugin.cli import main  # which takes a moment, in which Ctrl-C may be pressed
 
+        progress.silent_since(began)
         return main()
     except KeyboardInterrupt:  # before the command began, or after it ended
         signal.signal(signal.SIGINT, signal.SIG_IGN)

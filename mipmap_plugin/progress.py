@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import threading
@@ -70,6 +71,12 @@ def told(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
 def note(line: str) -> None:
     """Write a line to standard error, above the bars that are shown there."""
     tqdm.write(line, file=sys.stderr)
+
+
+def silent_since(moment: float) -> None:
+    """Count the silence before the first announced block from this moment of `time.monotonic()` on."""
+    global _silent_since, _ended_at
+    _silent_since, _ended_at = moment, math.inf
 
 
 @contextmanager

@@ -49,6 +49,16 @@ def test_short_work_one_after_the_other_is_announced_when_together_it_takes_long
     assert errors.getvalue() == shown
 
 
+def test_what_a_command_took_to_begin_counts_as_silence(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", errors := Terminal())
+    monkeypatch.setattr(progress, "PATIENCE", 3600)
+    monkeypatch.setattr(progress, "_silent_since", 0.0)
+    monkeypatch.setattr(progress, "_ended_at", 0.0)
+    progress.silent_since(time.monotonic() - 3600)
+    with progress.announced("starting"):
+        wait_until(lambda: "starting: " in errors.getvalue())
+
+
 class Log:
     """What a program may put in the place of standard error, to have it in a file of its own."""
 
