@@ -182,10 +182,10 @@ def _viewer_effects(settings: RenderSettings) -> list[Effect]:
 
 
 def _view_dependent_color(degree: int, gaussians: Gaussians) -> Effect:
-    held, bands = gaussians.sh_degree, (degree + 1) ** 2
+    held, used, bands = gaussians.sh_degree, gaussians.used_sh_degree(), (degree + 1) ** 2
     available = max(bands, gaussians.sh.shape[1])
-    more = f"SH up to degree {degree}, of the base up to {held}: merging has made room for more"
-    reason = more if degree > held else f"SH up to degree {degree} of {held}: above it every coefficient is 0"
+    more = f"SH up to degree {degree}, of the base up to {used}: merging has made room for more"
+    reason = more if degree > used else f"SH up to degree {degree} of {held}: above it every coefficient is 0"
     count = bands if degree > 0 else available - 1
     return Effect("view-dependent color", degree > 0, reason, f"a direction and {count} of {available} coefficients per splat")
 

@@ -10,6 +10,7 @@ import torch
 from pydantic import BaseModel, ConfigDict
 
 from mipmap_plugin.adaptation.curve import CurvePoint
+from mipmap_plugin.adaptation.start.bands import used_degree
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, enlarges, explain
@@ -162,7 +163,7 @@ def changes(base: SplatModel, adapted: SplatModel, scale: float) -> list[str]:
     if (rows := base.traits.rows) != SPLATS:
         left, all_of_them = (len(model.parameters()["means"]) for model in (adapted, base))
         found.append(f"{left:,} of {all_of_them:,} {rows} are left; the splats counted are those of one view")
-    degree, before_it = (getattr(model, "sh_degree", 0) for model in (adapted, base))
+    degree, before_it = (used_degree(model) for model in (adapted, base))
     if degree > before_it:
         found.append(f"colors depend on the view up to SH degree {degree}, those of the base up to {before_it}: merging had made room for it")
     moved = {name.partition(".")[0] for name, tensor in adapted.shared_parameters().items() if not torch.equal(tensor, before[name])}

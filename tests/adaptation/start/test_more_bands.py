@@ -75,6 +75,9 @@ def test_merged_splats_learn_colors_that_depend_on_the_view(tmp_path):
 def test_bands_that_a_file_has_for_nothing_are_used_where_merging_has_made_room():
     adapted = crowd(room=3).adapt(1 / 8, **STEPS)
     assert adapted.model.sh_degree == 3 and adapted.model.gaussians().used_sh_degree() == 2
+    assert any("up to SH degree 2, those of the base up to 0" in note for note in adapted.report.notes)
+    color = next(effect for effect in adapted.report.effects if effect.name == "view-dependent color")
+    assert color.reason == "SH up to degree 2, of the base up to 0: merging has made room for more"
 
 
 @pytest.mark.parametrize(
