@@ -29,7 +29,7 @@ from mipmap_plugin.commands.repeated import refuse_repeated
 from mipmap_plugin.commands.tradeoff import tradeoff
 from mipmap_plugin.commands.types import RULES
 from mipmap_plugin.commands.view import view
-from mipmap_plugin.errors import MipmapPluginError, SettingsError, hide_others_warnings, of_a_file
+from mipmap_plugin.errors import MipmapPluginError, SettingsError, hide_others_warnings, of_a_file, unknown
 from mipmap_plugin.formats.here import told_from_here
 from mipmap_plugin.limits import is_out_of_memory
 from mipmap_plugin.process.freed_memory import keep_freed_memory
@@ -95,6 +95,8 @@ def _parse(words: Sequence[str]) -> None:
         prog, summary = f"mipmap-plugin {words[0]}", (getdoc(command) or "").partition("\n\nArgs:")[0]
         described = f"{summary}\n\nExample: {prog} {EXAMPLES[words[0]]}"
         tyro.cli(_alone(command), prog=prog, description=described, args=words[1:], config=OPTIONS, registry=RULES)
+    elif words and not words[0].startswith("-"):
+        raise SettingsError(unknown("command", words[0], [*COMMANDS]))
     else:
         app.cli(prog="mipmap-plugin", description=DESCRIPTION, args=words, config=OPTIONS, registry=RULES)
 

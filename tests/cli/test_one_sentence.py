@@ -33,6 +33,12 @@ def test_the_version(run):
     assert "mipmap-plugin --version tells" in " ".join(run("--help")[1].split())
 
 
+@pytest.mark.parametrize(("word", "meant"), [("adpat", "; did you mean adapt?\n"), ("scene.ply", "tradeoff, backends, list, demo\n")])
+def test_a_command_that_there_is_not(run, word, meant):
+    """All its words were said to be misplaced options, and --scale to be what was meant."""
+    assert refused(run(word, "a.ply", "--scale", "1/4"), f"there is no command '{word}'; choose from inspect, adapt, ").endswith(meant)
+
+
 def test_a_path_that_begins_with_a_dash(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     tiny.ply(Path("./-a.ply"))
