@@ -12,7 +12,7 @@ from typing import Any
 
 from mipmap_plugin.adaptation.report import provenance, versions
 from mipmap_plugin.adaptation.target.upsamplers import network_input
-from mipmap_plugin.errors import TEMPORARY, MipmapPluginError, SettingsError
+from mipmap_plugin.errors import TEMPORARY, MipmapPluginError, SettingsError, plural
 from mipmap_plugin.formats.glb import bytes_before_binary
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import WRITTEN
@@ -81,7 +81,7 @@ def splats_within(model: SplatModel, size: int, name: str, record: dict[str, Any
     else:
         fitting = int((COMPRESSED_MARGIN * size if ending in WRITTEN else size - ARCHIVE) * count / all_of_them)
     if fitting < 1:
-        raise SettingsError(f"bytes: {size:,} bytes hold no splat of this checkpoint and a header; allow more")
+        raise SettingsError(f"bytes: {plural(size, 'byte')} have no room for a header and a splat of this checkpoint; allow more")
     return min(count, fitting)
 
 

@@ -52,7 +52,7 @@ def test_as_many_splats_as_fit_into_a_file_do_fit(tmp_path):
         saved = tiny.model(most).save(tmp_path / name, provenance=record)
         assert size - UNKNOWN - ROW <= saved.stat().st_size <= size - UNKNOWN and splats_within(model, size, name, record) == most
     assert splats_within(model, 10**9, "file.ply", {}) == 500
-    with pytest.raises(SettingsError, match="hold no splat"):
+    with pytest.raises(SettingsError, match="3,000 bytes have no room for a header and a splat"):
         splats_within(model, 3000, "file.ply", record)
 
 
