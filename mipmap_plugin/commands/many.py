@@ -74,6 +74,7 @@ def adapt_many(many: Many, given: Sequence[Path], request: Request, base: Base, 
     with announced("looking for checkpoints"):
         jobs = make_jobs(many, given, request, base)
     outcomes: list[Outcome] = []
+    again = "the same command" + (" with --skip-existing" if request.overwrite and not many.skip_existing else "")
     missing = {folder for job in jobs for folder in missing_folders(job.target.parent)}
     try:
         with closing(engine(many, jobs, threads)) as running:
@@ -82,13 +83,12 @@ def adapt_many(many: Many, given: Sequence[Path], request: Request, base: Base, 
                 note(str(outcome), urgent=outcome.status == "failed")
     except KeyboardInterrupt as interrupt:
         _print(outcomes, jobs, json)
-        again = " with --skip-existing" if request.overwrite and not many.skip_existing else ""
-        raise KeyboardInterrupt(f"interrupted; run the same command again{again} to go on where it stopped") from interrupt
+        raise KeyboardInterrupt(f"interrupted; run {again} again to go on where it stopped") from interrupt
     finally:  # a job that fails leaves a folder that another one was using
         remove_empty(sorted(missing, key=lambda folder: len(folder.parts), reverse=True))
     _print(outcomes, jobs, json)
     if failed := [outcome for outcome in outcomes if outcome.status != "done" and outcome.status != "finished before"]:
-        raise JobsFailed(f"{len(failed)} of {plural(len(jobs), 'job')} failed; the same command does these again, and no other")
+        raise JobsFailed(f"{len(failed)} of {plural(len(jobs), 'job')} failed; {again} does these again, and no other")
 
 
 def make_jobs(many: Many, given: Sequence[Path], request: Request, base: Base) -> list[Job]:

@@ -60,6 +60,15 @@ def test_of_many_jobs_that_warn_of_the_same_a_few_are_named(tmp_path, monkeypatc
     assert warned(outcomes[:1]) == ["base.ply x1: mind this"]
 
 
+@pytest.mark.parametrize(("words", "again"), [([], ""), (["--overwrite"], " with --skip-existing"), (["--overwrite", "--skip-existing"], "")])
+def test_what_failed_is_done_again_alone_by_the_command_that_is_told(run, scenes, words, again):
+    """With --overwrite the same command does all again."""
+    (scenes / "broken.ply").write_text("no splats")
+    command = ["adapt", scenes / "broken.ply", scenes / "chair", "--scale", "1/2", *NO_STEP, *words]
+    assert f"1 of 2 jobs failed; the same command{again} does these again, and no other" in run(*command)[2]
+    assert "2 jobs: 1 failed, 1 finished before" in run(*command, *again.split()[1:])[1]
+
+
 def test_a_quiet_batch_tells_what_failed_and_its_log_tells_all(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     tiny.folder(tmp_path / "a", tiny.cameras(3))
