@@ -31,6 +31,7 @@ def adapt_tiled(many: Many, given: Sequence[Path], request: Request, base: Base,
         raise SettingsError("--tiles needs a folder that all workers see, so that files are not sent; leave --send-files out")
 
     jobs = jobs_of(given[0], request, base)
+    engine(many, jobs, threads)  # begins nothing, and raises what is wrong with its options before the scene is cut
     skip = many.skip_existing or (len(jobs) > 1 and not request.overwrite)  # as in a list
     reports = finished_before(jobs, json, may_load=False) if skip else {}  # the base may not fit into memory
     left = [job for job in jobs if job.target not in reports]

@@ -210,6 +210,7 @@ def test_jobs_of_several_bases_or_of_one_output_are_refused(job, tmp_path):
         ("a.ply b.ply --scale 1/2 --tiles 2", "--tiles cuts one checkpoint"),
         ("a.ply --scale 1/2 --tiles 2 --report", "without --tiles"),
         ("a.ply --scale 1/2 --tiles 2 --dask local:2 --send-files", "leave --send-files out"),
+        ("a.ply --scale 1/2 --tiles 2 --jobs 0", "--jobs must be at least 1, got 0"),
     ],
 )
 def test_commands_that_cannot_be(words, reason, capsys):
