@@ -71,6 +71,10 @@ def _alone(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
+        try:
+            os.getcwd()
+        except FileNotFoundError:
+            raise SettingsError("the folder that this command was started in is gone; change to another, or to a new one of that name") from None
         with voice.alone(json=kwargs.get("json", False)):
             command(*args, **kwargs)
 

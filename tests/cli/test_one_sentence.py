@@ -167,13 +167,15 @@ def test_what_is_refused_is_told_by_its_path_from_here(run, tmp_path, monkeypatc
     assert told in refused(run(*words.split()))
 
 
-def test_what_is_refused_is_told_where_the_current_folder_was_deleted(run, tmp_path, monkeypatch):
+def test_a_current_folder_that_was_deleted_is_told_of(run, tmp_path, monkeypatch):
+    """The system says of no path that it does not exist, and MKL that it cannot be loaded."""
     monkeypatch.chdir(tmp_path)  # which pytest leaves before it goes on
     gone = tmp_path / "gone"
     gone.mkdir()
     os.chdir(gone)
     gone.rmdir()
-    refused(run("inspect", str(tmp_path / "none.ply")), f"{tmp_path / 'none.ply'} does not exist")
+    for words in (["inspect", tiny.ply(tmp_path / "a.ply")], ["adapt", "a.ply", "--scale", "1/4"]):
+        refused(run(*words), "the folder that this command was started in is gone; change to another")
 
 
 @pytest.mark.parametrize("words", ["levels base.ply --viewer spark --output new.ply", "tradeoff base.ply --scale 1/2 --output new.json --no-picture"])
