@@ -19,6 +19,9 @@ from mipmap_plugin.models.zipped_folder import opened, retold, told
 EXCHANGED, PHOTOGRAPHS = (".spz", ".sog", ".splat", ".ksplat", ".glb", ".gltf"), (".jpg", ".jpeg", ".png")
 OWN_SUFFIXES = (".ply", ".pt", ".ckpt", *EXCHANGED)
 
+# The points that a training of 3DGS starts from, in its model folder.
+START = "input.ply"
+
 # What else people give, by its suffix: what it is, and what to do.
 OTHERS = {
     **dict.fromkeys((*PHOTOGRAPHS, ".mp4", ".mov"), "a photograph or a video, not a trained scene; train one on it first, and give that"),
@@ -166,7 +169,8 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
     if iteration is not None:
         raise CheckpointError(f"{folder} has no point_cloud/iteration_{iteration}; give the model folder above it, or no iteration")
     files = sorted(folder.iterdir())
-    clouds = [file for file in files if file.suffix.lower() == ".ply"]
+    trained = [file for file in files if file.name != START or not (folder / "cfg_args").exists()]
+    clouds = [file for file in trained if file.suffix.lower() == ".ply"]
     clouds = clouds or [file for file in files if file.suffix.lower() in EXCHANGED and file.is_file()]
     clouds = [cloud for cloud in clouds if not has_report(cloud)] or clouds  # no adaptations, where there is a base
     if len(clouds) > 1 and folder / "point_cloud.ply" in clouds:
