@@ -76,12 +76,12 @@ def test_folder_with_one_ply_and_with_several(tmp_path):
     assert detect(tmp_path).path == named
 
 
-def test_the_points_that_a_training_starts_from_are_no_file_of_splats(tmp_path):
-    write(tmp_path / "input.ply", {axis: np.zeros(2, np.float32) for axis in "xyz"})
-    (tmp_path / "cfg_args").write_text("Namespace()")
-    with pytest.raises(CheckpointError, match=r"no point_cloud folder and no file of splats; give .* model folder with point_cloud/iteration_<N>"):
+def test_points_that_a_training_starts_from_are_no_file_of_splats(tmp_path):
+    for name in ("input.ply", "points3D.ply"):
+        write(tmp_path / name, {column: np.zeros(2, np.float32) for column in ("x", "y", "z", "red")})
+    with pytest.raises(CheckpointError, match=r"no file of splats, but plain point clouds or meshes \(input.ply, points3D.ply\); give one file"):
         detect(tmp_path)
-    only = write_splats(tmp_path / "fused.ply")
+    only = write_splats(tmp_path / "splat.ply")
     assert detect(tmp_path).path == only
 
 
