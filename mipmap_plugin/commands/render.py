@@ -62,7 +62,7 @@ def render(
         checkpoint: A PLY, .spz, .sog, .splat or .glb, or a model folder.
         output: The folder for the pictures.
         scale: Zoom, relative to the cameras; by default the scale that the file was adapted to, or else 1.
-        view: Name of a view; may be given several times. By default all test views, or all if there are none.
+        view: Name of a view, or of its picture; may be given several times. By default all test views, or all if there are none.
         time: Moment of a moving scene, 0 to 1, in place of those of the views; given several times: each view at each moment.
         screen_filter: trained: the filter of the checkpoint's training; scaled: the training-free filter for this scale.
         viewer: Render as this viewer (an unknown name lists all): classic, spark, ... By default the file's own, unless a screen filter is given.
@@ -238,8 +238,10 @@ def _named(wrapped: Wrapped, names: Sequence[str]) -> list[Camera]:
     cameras = wrapped.views()
     if not names:
         return [c for c in cameras if c.split == "test"] or cameras
-    chosen = [c for c in cameras if c.name in names]
-    if missing := set(names) - {c.name for c in chosen}:
+    called = {picture.removesuffix(".png"): c.name for c, picture in zip(cameras, picture_names(cameras), strict=True)}  # as pictures are, too
+    wanted = {name if name in called.values() else called.get(name.removesuffix(".png"), name) for name in names}
+    chosen = [c for c in cameras if c.name in wanted]
+    if missing := wanted - {c.name for c in chosen}:
         some = ", ".join(c.name for c in cameras[:5])
         raise SettingsError(f"there is no view {', '.join(sorted(missing))}; the first of {len(cameras)} are {some}")
     return chosen

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.codebooks import codebook, palette
 from mipmap_plugin.formats.images import lossless_webp
 from mipmap_plugin.formats.tags import DAMAGE, meta_of_sog
@@ -102,6 +103,24 @@ def completed(source: Path, folder: Path) -> Path:
         if isinstance(error, OSError) and error.errno in FULL:
             raise  # without its copy the file would be read with wrong colors
         return source  # of which splat-transform tells
+
+
+def environment_of(streamed: Path) -> list[Path]:
+    """The sky and the distance of a Streamed SOG, a SOG of their own, which viewers always show and splat-transform leaves out; empty for none.
+
+    Raises CheckpointError if it is not there. The name is not trusted: splat-transform loads addresses, and executes files of some kinds.
+    """
+    try:
+        name = json.loads(streamed.read_bytes())["environment"]
+        environment = (streamed.parent / name).resolve() if name else None
+    except DAMAGE:
+        return []  # splat-transform tells what is wrong with the file
+    if environment is None:
+        return []
+    trusted = environment.is_relative_to(streamed.parent.resolve()) and (environment.suffix == ".sog" or environment.name == "meta.json")
+    if not (trusted and environment.is_file()):
+        raise CheckpointError(f"{streamed} names an environment that is missing, {str(name)[:120]}; copy or download its whole folder again")
+    return [environment]
 
 
 def _folder_in(source: Path) -> str:

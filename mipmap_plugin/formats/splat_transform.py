@@ -110,7 +110,7 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
     Raises CheckpointError.
     """
     from mipmap_plugin.formats.damage import damage_of  # and NumPy, without which options are read
-    from mipmap_plugin.formats.sog import completed
+    from mipmap_plugin.formats.sog import completed, environment_of
 
     name, ending = EXCHANGE[kind]
     tool = find_tool()
@@ -126,7 +126,12 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
             source = Path(folder, f"source{ending}")
             shutil.copyfile(path, source)
         plain = Path(folder, "plain.ply")
-        if reason := _run(tool, [completed(source, Path(folder)) if kind == "sog" else source], plain):
+        inputs = [completed(source, Path(folder)) if kind == "sog" else source]
+        if path.name == LOD_META:
+            inputs += environment_of(source)
+        if reason := _run(tool, inputs, plain):
+            if answer([*tool, "--version"]) is None:  # as where packages that it needs are missing, or with an old Node.js
+                raise CheckpointError(f"{path} is {name}, which {TOOL} reads, but {TOOL} does not start ({reason}); run: {INSTALL}")
             raise CheckpointError(f"{path} is {name}, but {TOOL} does not read it ({reason}); export it again")
         try:
             _settle_frame(tool, source, plain)

@@ -101,7 +101,7 @@ def notes_on(extras: Mapping[str, np.ndarray]) -> list[str]:
     notes = [f"extra columns are carried along: {', '.join(names)}"] if names else []
     if all(name in extras and (extras[name] == value).all() for name, value in zip(NORMAL, GRUT_NORMAL, strict=True)):
         kernel = "whose particles are Gaussians only of degree 2, which is not its default"
-        notes.append(f"its normals are those that 3DGRUT and MetalSplatter write: if it was trained with 3DGRT, {kernel}, it is drawn otherwise here")
+        notes.append(f"its normals are those that 3DGRUT, MetalSplatter and wgpu-3dgs write: if 3DGRT trained it, {kernel}, it is drawn otherwise")
     return notes
 
 

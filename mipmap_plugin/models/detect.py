@@ -19,6 +19,11 @@ from mipmap_plugin.models.zipped_folder import opened, retold, told
 EXCHANGED, PHOTOGRAPHS = (".spz", ".sog", ".splat", ".ksplat", ".glb", ".gltf"), (".jpg", ".jpeg", ".png")
 OWN_SUFFIXES = (".ply", ".pt", ".ckpt", *EXCHANGED)
 
+# Columns of plain point clouds and meshes, among which are the points that a training starts from: input.ply, points3D.ply, sparse_pc.ply.
+OF_POINTS = frozenset(
+    ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha", "s", "t", "u", "v", "flags", "quality", "confidence", "intensity")
+)
+
 # What else people give, by its suffix: what it is, and what to do.
 OTHERS = {
     **dict.fromkeys((*PHOTOGRAPHS, ".mp4", ".mov"), "a photograph or a video, not a trained scene; train one on it first, and give that"),
@@ -166,7 +171,7 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
     if iteration is not None:
         raise CheckpointError(f"{folder} has no point_cloud/iteration_{iteration}; give the model folder above it, or no iteration")
     files = sorted(folder.iterdir())
-    clouds = [file for file in files if file.suffix.lower() == ".ply"]
+    clouds = [file for file in files if file.suffix.lower() == ".ply" and not _holds_points(file)]
     clouds = clouds or [file for file in files if file.suffix.lower() in EXCHANGED and file.is_file()]
     clouds = [cloud for cloud in clouds if not has_report(cloud)] or clouds  # no adaptations, where there is a base
     if len(clouds) > 1 and folder / "point_cloud.ply" in clouds:
@@ -183,6 +188,14 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
     raise CheckpointError(f"{folder} holds {content}; give one file, or a model folder with point_cloud/iteration_<N>")
 
 
+def _holds_points(file: Path) -> bool:
+    """Whether a PLY holds a plain point cloud or a mesh."""
+    try:
+        return frozenset() < Files(file).columns <= OF_POINTS
+    except CheckpointError:
+        return False
+
+
 def _instead(folder: Path) -> str:
     """What people mean who give a folder without splats, in words: a folder below, or what a scene is trained on."""
     try:
@@ -192,6 +205,8 @@ def _instead(folder: Path) -> str:
     meant = [entry for entry in entries if entry.is_dir() and any(entry.glob("*.ply"))]
     if meant:
         return f", but {', '.join(entry.name for entry in meant[:5])}{', ...' * (len(meant) > 5)}"
+    if points := [entry.name for entry in entries if entry.suffix.lower() == ".ply"]:
+        return f", but plain point clouds or meshes ({', '.join(points[:5])}{', ...' * (len(points) > 5)})"
     if any(entry.suffix.lower() in PHOTOGRAPHS or entry.name in ("images", "sparse") or entry.match("transforms*.json") for entry in entries):
         return ", but photographs or what a scene is trained on (that is for --images and --cameras)"
     return ""

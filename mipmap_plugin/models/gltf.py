@@ -29,6 +29,9 @@ FROM_SCENE = np.diag([-1.0, -1.0, 1.0, 1.0])
 # Relative differences between the axes of a node's matrix, and from right angles, that are taken for rounding.
 UNEVEN = 1e-4
 
+# So many negative sizes are no errors: they are logarithms, as in drafts, some of which have the names of today; in a scene of large units few are.
+LOGARITHMS = 0.01
+
 
 def load_gltf(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
     """Load the splats of a .glb or .gltf, in the frame of a PLY. Raises CheckpointError."""
@@ -55,7 +58,7 @@ def load_gltf(path: str | Path, *, iteration: int | None = None) -> VanillaModel
 def _raw(attributes: dict[str, np.ndarray], file: Path) -> dict[str, Tensor]:
     """Raw parameters (`columns.to_parameters`) of a primitive's attributes. Raises CheckpointError for missing ones and wrong shapes.
 
-    In drafts sizes were logarithms, most of which are negative, and in the first opacities and colors were those of COLOR_0.
+    In drafts sizes were logarithms, and in the first opacities and colors were those of COLOR_0.
     """
     values = {name: torch.from_numpy(array) for name, array in attributes.items()}
     needed = ("POSITION", "ROTATION", "SCALE", *(() if {"OPACITY", "SH_DEGREE_0_COEF_0"} <= values.keys() else ("COLOR_0",)))
@@ -68,7 +71,7 @@ def _raw(attributes: dict[str, np.ndarray], file: Path) -> dict[str, Tensor]:
         sh = torch.stack([sh0, *_bands(values, file)], dim=1)
         raw = {
             "means": values["POSITION"],
-            "scales": scales if (scales < 0).float().mean() > 1 / 2 else log(scales),
+            "scales": scales if (scales < 0).float().mean() > LOGARITHMS else log(scales),
             "quats": values["ROTATION"][:, [3, 0, 1, 2]],
             "opacities": logit(opacities),
             "sh0": sh[:, :1],

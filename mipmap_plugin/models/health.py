@@ -132,7 +132,7 @@ def examine(model: SplatModel) -> Health:
     """Examine a model whose parameters have gsplat's names (means, scales, quats, opacities, sh0, shN)."""
     raw = {name: tensor.detach() for name, tensor in model.parameters().items()}
     scales, opacities = raw["scales"].exp(), raw["opacities"].sigmoid()
-    extent = _extent(raw["means"])
+    extent = extent_of(raw["means"])
     steps = _coarse_steps(raw["means"], scales, extent)
     thin = scales < TINY_SHARE * extent
     sizeless, invisible = thin.all(1), opacities < MIN_VISIBLE
@@ -222,7 +222,8 @@ def _coarse_steps(means: Tensor, scales: Tensor, extent: float) -> Tensor:
     return steps[farthest.isfinite() & (steps > COARSE_STEP * scales.amax(1)) & (steps > TINY_SHARE * extent)]
 
 
-def _extent(means: Tensor) -> float:
+def extent_of(means: Tensor) -> float:
+    """World units: the longest side of the box around the scene, outliers left out; 0 for fewer than two finite splats. `means`: [N, 3]."""
     means = means[means.isfinite().all(1)]
     if len(means) < 2:
         return 0.0

@@ -19,7 +19,7 @@ from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_glb, is_s
 from mipmap_plugin.formats.spz import fraction_for
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.health import COARSE_SHARE, COARSE_STEP, rows_where
+from mipmap_plugin.models.health import COARSE_SHARE, COARSE_STEP, extent_of, rows_where
 from mipmap_plugin.models.places import CONVERTED, PARTS, REPORT, STATE, has_report
 
 # What is written into a model folder, of all families.
@@ -33,6 +33,9 @@ USUAL_FRACTION = 12
 
 # What SPZ stores: log scales, the size of the coefficients of degree 0 (whose color lies between -0.44 and 1.44), and that of all others.
 SPZ_LOG_SCALES, SPZ_COLOR, SPZ_HARMONICS = (-10.0, 5.9375), 0.5 / 0.15, 1.0
+
+# A length that is seen, as a fraction of the scene's: a quarter of a pixel, less than any filter's, where the scene is 1,000 pixels wide.
+SEEN_LENGTH = 2.5e-4
 
 # Finite numbers that in float32 activate as an infinite logit and logarithm do: to an opacity of 1 or 0, and a length of almost 0.
 LOGIT, LOG_SCALE = 80.0, -87.0
@@ -113,15 +116,17 @@ def without_place(path: Path, extras: Iterable[str], sh_degree: int) -> str:
 def cut_off(path: Path, parameters: Mapping[str, Tensor]) -> str:
     """How many of the splats with these raw `parameters` an SPZ at `path` cannot hold, even rounded, in a sentence; "" for any other format.
 
-    Of thin splats only the longest axis counts: the others are lengthened by less than anybody sees.
+    Of thin splats only the longest axis counts: the others are lengthened by less than anybody sees. So are splats that are shorter than SPZ has room
+    for, as a zoom-out makes many, in a scene of some size.
     """
-    if not is_spz(path) or not {"scales", "sh0", "shN"} <= parameters.keys():
+    if not is_spz(path) or not {"means", "scales", "sh0", "shN"} <= parameters.keys():
         return ""
     longest, (least, most) = parameters["scales"].detach().amax(dim=1), SPZ_LOG_SCALES
+    seen = math.exp(least) > SEEN_LENGTH * extent_of(parameters["means"].detach())
     colors, harmonics = (parameters[name].detach().abs().flatten(1) for name in ("sh0", "shN"))
     beyond = {
         f"longer than {math.exp(most):,.0f} units": longest > most,
-        f"shorter than {math.exp(least):.2g} units": longest < least,
+        f"shorter than {math.exp(least):.2g} units": (longest < least) & seen,
         "with a color of degree 0 outside -0.44 to 1.44": (colors > SPZ_COLOR).any(dim=1),
         "with other harmonics outside -1 to 1": (harmonics > SPZ_HARMONICS).any(dim=1),
     }

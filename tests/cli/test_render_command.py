@@ -84,6 +84,12 @@ def test_render_takes_a_folder_and_not_the_name_of_a_picture(run, model_folder, 
     assert not (tmp_path / "view.PNG").exists()
 
 
+@pytest.mark.parametrize("name", ["train_view_1", "train_view_1.png"])
+def test_a_view_may_be_called_as_its_picture_is(run, model_folder, tmp_path, name):
+    assert run("render", model_folder, "--output", tmp_path / "out", "--view", name)[0] == 0
+    assert [picture.name for picture in (tmp_path / "out").iterdir()] == ["train_view_1.png"]
+
+
 def test_render_refuses_names_that_are_not_there_and_pictures_that_are(run, model_folder, tmp_path):
     refused(run("render", model_folder, "--output", tmp_path / "out", "--view", "nowhere"), "there is no view nowhere; the first of 4 are view_")
     words = ["render", model_folder, "--output", tmp_path / "out", "--view", "view_1"]

@@ -215,6 +215,43 @@ def test_streamed_sog_is_read_by_a_splat_transform_that_knows_it(tmp_path, tool)
     )
 
 
+@pytest.mark.parametrize("name", ["env/meta.json", "environment.sog"])
+def test_the_environment_of_a_streamed_sog_is_read_with_it(tmp_path, tool, name):
+    """The sky of a capture, which splat-transform leaves out of a scene."""
+    (tmp_path / "lod-meta.json").write_text(json.dumps({"lodLevels": 1, "environment": name, "filenames": ["0_0/meta.json"], "tree": {}}))
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("{}")
+    assert len(load_model(tmp_path)) == 60
+    options, environment, _, _ = tool_request(tool)
+    assert (options[-1], environment) == (str(tmp_path / "lod-meta.json"), str(tmp_path / name))
+
+
+@pytest.mark.parametrize("name", ["environment.sog", "../environment.sog", "https://a.b/environment.sog", "environment.mjs"])
+def test_an_environment_that_is_not_in_the_folder_is_refused(tmp_path, tool, name):
+    """And not loaded from elsewhere, nor executed."""
+    for place in ("environment.sog", "streamed/environment.mjs"):
+        (tmp_path / place).parent.mkdir(exist_ok=True)
+        (tmp_path / place).write_text("{}")
+    (tmp_path / "streamed/lod-meta.json").write_text(json.dumps({"lodLevels": 1, "environment": name, "filenames": ["0_0/meta.json"], "tree": {}}))
+    assert f"names an environment that is missing, {name}; copy or download its whole folder again" in sentence(tmp_path / "streamed")
+
+
+def test_a_splat_transform_that_does_not_start_is_no_fault_of_the_file(tmp_path, tool):
+    answer_by(tool, "sys.exit(\"Error [ERR_MODULE_NOT_FOUND]: Cannot find package 'webgpu'\")")
+    (tmp_path / "a.spz").write_bytes(SPZ)
+    assert sentence(tmp_path / "a.spz").endswith(
+        "a.spz is SPZ, which splat-transform reads, but splat-transform does not start (Cannot find package 'webgpu'); "
+        "run: npm install -g @playcanvas/splat-transform"
+    )
+
+
+def test_an_spz_with_a_long_name_in_its_gzip_header_is_one(tmp_path, tool):
+    """Longer than what is read of other files."""
+    packed = gzip.compress(SPZ)
+    (tmp_path / "a.spz").write_bytes(packed[:3] + b"\x08" + packed[4:10] + b"n" * 70_000 + b"\0" + packed[10:])
+    assert detect(tmp_path / "a.spz").family == "exchange"
+
+
 def test_an_error_of_node_is_told(tmp_path, tool):
     answer_by(tool, "print('failed in 0.006s')\nsys.exit('TypeError [ERR_PARSE_ARGS_UNKNOWN_OPTION]: Unknown option')")
     with pytest.raises(OutputError, match=r"does not write it \(Unknown option\)"):

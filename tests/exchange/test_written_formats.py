@@ -18,6 +18,7 @@ from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.readers import refuse_unread
 from mipmap_plugin.levels.tiles import write_tile
 from mipmap_plugin.models import load_model
+from mipmap_plugin.models.outputs import cut_off
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
@@ -113,6 +114,7 @@ def test_columns_that_a_format_has_no_place_for_are_told_of_and_in_the_report(tm
 def test_what_spz_cuts_off_is_told_of_and_in_the_report(tmp_path, tool, ending, capsys):
     """Its limits were in the documentation only. A thin splat's shorter axes do not count."""
     columns = dict(read_ply(tiny.ply(tmp_path / "a.ply")).columns)
+    columns |= {axis: columns[axis] / 100 for axis in "xyz"}  # a small scene, of which the shortest length is seen
     columns["scale_0"][0], columns["f_dc_1"][1:3], columns["f_rest_4"][3], columns["scale_2"][4] = 6.5, -3.5, 1.5, -20
     for axis in range(3):
         columns[f"scale_{axis}"][5:9] = -10.5
@@ -122,6 +124,12 @@ def test_what_spz_cuts_off_is_told_of_and_in_the_report(tmp_path, tool, ending, 
     lost = "1 longer than 379 units, 4 shorter than 4.5e-05 units, 2 with a color of degree 0 outside -0.44 to 1.44, 1 with other harmonics"
     told = f"SPZ cuts off, of 60 splats, {lost} outside -1 to 1; a .ply keeps them"
     assert capsys.readouterr().err.count(told) == report_of(made)["notes"].count(told) == int(ending == ".spz")
+
+
+def test_splats_lengthened_by_less_than_anybody_sees_are_not_told_of(tmp_path):
+    """A zoom-out makes splats shorter than a pixel into dots, which in an SPZ are dots as well."""
+    parameters = load_model(tiny.ply(tmp_path / "a.ply")).parameters()
+    assert cut_off(tmp_path / "a.spz", {**parameters, "scales": torch.full_like(parameters["scales"], -10.5)}) == ""
 
 
 @pytest.mark.parametrize("ending", [".spz", ".compressed.ply", ".ply"])

@@ -133,6 +133,16 @@ def test_the_drafts_sizes_are_logarithms_and_their_colors_are_called_otherwise(t
     assert_moved(read, splats, HALF_TURN)
 
 
+def test_the_drafts_sizes_are_logarithms_in_large_units_too(tmp_path):
+    """Most of them are positive there; the review draft's other names are those of today."""
+    splats = tiny.gaussians()
+    splats = replace(splats, scales=splats.scales / splats.scales.quantile(0.2))
+    named = gltf_files.attributes(splats)
+    named[f"{EXTENSION}:SCALE"] = np.log(named[f"{EXTENSION}:SCALE"])
+    assert 0.1 < (named[f"{EXTENSION}:SCALE"] < 0).mean() < 0.3
+    assert_moved(load(tmp_path, *gltf_files.document(named)), splats, HALF_TURN)
+
+
 def test_the_first_drafts_colors_and_opacities_are_those_of_points(tmp_path):
     splats = tiny.gaussians(degree=0)
     splats = replace(splats, sh=splats.sh.clamp(-1.5, 1.5))

@@ -77,7 +77,7 @@ def test_the_error_for_saga_names_the_file_of_its_scene(tmp_path):
 
 def test_a_ply_of_3dgrut_is_read_with_a_note(tmp_path):
     up = {name: np.full(4, value, np.float32) for name, value in {"nx": 0, "ny": 0, "nz": 1}.items()}
-    assert any("3DGRUT and MetalSplatter write" in note for note in load_model(write(tmp_path / "a.ply", {**COLUMNS, **up})).notes)
+    assert any("3DGRUT, MetalSplatter and wgpu-3dgs write" in note for note in load_model(write(tmp_path / "a.ply", {**COLUMNS, **up})).notes)
     askew = up | {"nz": np.linspace(0.9, 1, 4, dtype=np.float32)}
     assert not any("3DGRUT" in note for note in load_model(write(tmp_path / "b.ply", {**COLUMNS, **askew})).notes)
 

@@ -1,9 +1,10 @@
 """Folders: which checkpoint of them is taken, what their options say, and what is said where there is none."""
 
+import numpy as np
 import pytest
 import torch
 import torch_checkpoints
-from ply_files import write_model_folder, write_splats
+from ply_files import write, write_model_folder, write_splats
 
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.cfg_args import format_cfg_args, read_cfg_args
@@ -73,6 +74,15 @@ def test_folder_with_one_ply_and_with_several(tmp_path):
         detect(tmp_path)
     named = write_splats(tmp_path / "point_cloud.ply")
     assert detect(tmp_path).path == named
+
+
+def test_points_that_a_training_starts_from_are_no_file_of_splats(tmp_path):
+    for name in ("input.ply", "points3D.ply"):
+        write(tmp_path / name, {column: np.zeros(2, np.float32) for column in ("x", "y", "z", "red")})
+    with pytest.raises(CheckpointError, match=r"no file of splats, but plain point clouds or meshes \(input.ply, points3D.ply\); give one file"):
+        detect(tmp_path)
+    only = write_splats(tmp_path / "splat.ply")
+    assert detect(tmp_path).path == only
 
 
 def test_cfg_args_of_every_shape(tmp_path):
