@@ -217,6 +217,8 @@ def test_the_command_makes_a_ladder_and_prints_it(tmp_path, capsys):
     assert manifest == json.loads((tmp_path / "ladder" / MANIFEST).read_text())
     print_summary(tmp_path, manifest)
     said = capsys.readouterr().out
+    base = [point["base_db"] for point in manifest["curve"]]
+    assert f"the base alone: at worst {min(base):.1f} dB, {sum(base) / len(base):.1f} on average\n" in said
     print_summary(tmp_path, manifest | {"levels": manifest["levels"][:1]})
     assert capsys.readouterr().out.startswith(f"{tmp_path}, for antialiased: 1 level\n")
     print_summary(tmp_path, manifest | {"levels": [manifest["levels"][0] | {"psnr_db": {"1": 27.53, "0.5": 27.46}}]})
