@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from mipmap_plugin.commands.common import print_json
@@ -23,10 +24,11 @@ def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path
     if missed := _below(manifest):
         lines.append(f"  {', '.join(missed)}: below the {manifest['least_db']:g} dB that were asked for, in the narrowest band that is tried")
     lines += _left_out(manifest)
-    base = min(point["base_db"] for point in manifest["curve"])
+    base = [point["base_db"] for point in manifest["curve"]]
     steps = [abs(each["step_db"]) for each in manifest["switches"] if "step_db" in each]
     changed = f", at most {max(steps):.1f} lost or gained at a switch" if steps else ""
-    lines.append(f"  at worst {manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} on average{changed}; the base alone falls to {base:.1f} dB")
+    ladder = f"at worst {manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} on average"
+    lines.append(f"  {ladder}{changed}; the base alone: at worst {min(base):.1f} dB, {fmean(base):.1f} on average")
     lines.append(f"  {manifest['measured']}")
     say("\n".join([*lines, *(look_at(path) if path.name == PAGE else f"  {path}" for path in exports)]))
 

@@ -31,15 +31,15 @@ class Exports:
 
     streamed_sog: bool
     tiles: bool
-    canvas: int | None  # px, of Streamed SOG; None: the usual one
+    canvas: int | None  # px; None: the usual one
     title: str | None = None  # of the report page; None: no page
 
     def check(self, output: Path) -> None:
         """Raise SettingsError for an impossible canvas or one of nothing, or if splat-transform is needed and not installed, or too old."""
         if self.canvas is not None and self.canvas < 1:
             raise SettingsError(f"canvas: must be at least 1 px, got {self.canvas}")
-        if self.canvas is not None and not self.streamed_sog:
-            raise SettingsError("--canvas is for the distances of Streamed SOG; give --streamed-sog too, or leave --canvas out")
+        if self.canvas is not None and not (self.streamed_sog or self.tiles):
+            raise SettingsError("--canvas is for the distances of Streamed SOG and 3D Tiles; give --streamed-sog or --tiles, or leave --canvas out")
         if self.streamed_sog or self.tiles:
             refuse_exchange(output)  # where it is not installed
             refuse_exchange(output / (LOD_META if self.streamed_sog else "tiles.spz"))  # where it is too old
@@ -54,8 +54,9 @@ class Exports:
         if self.title is not None:
             with announced("drawing the page"):
                 page = [write_levels_page(ladder, contents, self.title)]
-        streamed = [write_streamed(ladder, self.canvas or CANVAS)] if self.streamed_sog else []
-        return streamed + ([write_tiles(ladder)] if self.tiles else []) + page
+        canvas = self.canvas or CANVAS
+        streamed = [write_streamed(ladder, canvas)] if self.streamed_sog else []
+        return streamed + ([write_tiles(ladder, canvas)] if self.tiles else []) + page
 
 
 def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Exports, overwrite: bool) -> tuple[dict[str, Any], list[Path]]:

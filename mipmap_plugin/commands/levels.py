@@ -54,7 +54,7 @@ def levels(
         by: zoom, one scale for the whole scene; distance, one for each splat; auto: distance for viewers that stream and a background far behind.
         streamed_sog: Also write Streamed SOG for PlayCanvas, SuperSplat and Babylon.js, through splat-transform, with the distances to set there.
         tiles: Also write 3D Tiles for Cesium, through splat-transform.
-        canvas: With --streamed-sog: the shorter side in px of the canvas that its distances are computed for; by default 1080.
+        canvas: With --streamed-sog or --tiles: the shorter side in px of the canvas that distances are computed for; by default 1080.
         recipe: default, thorough (more steps and views), instant (no optimization), or a registered one.
         views: Which views to adapt to; by default those of the recipe.
         steps: Maximum number of optimizer steps for each level.

@@ -81,7 +81,7 @@ class LadderRequest:
             raise SettingsError(f"least_db: must be a number of dB, such as 32, got {self.least_db:g}")
         if self.by not in WAYS:
             raise SettingsError(f"by: must be one of {', '.join(WAYS)}, got {self.by}")
-        if taken := {"band", "start", "viewer", "scale", "images"} & self.settings.keys():
+        if taken := {"band", "start", "viewer", "scale", "images", "most_sh_degree"} & self.settings.keys():
             raise SettingsError(f"{', '.join(sorted(taken))}: set by the ladder for each level; leave out")
         recipe(self.recipe, self.coarsest, **self.settings)  # raises before anything is read or kept
 
@@ -110,7 +110,7 @@ class LadderRequest:
     def arguments(self, settings: Mapping[str, Any]) -> dict[str, Any]:
         """The arguments of `adapt` for a level with these settings; those of the request override them.
 
-        Levels get no SH bands beyond the base's: merging does not make room for a file there, but for further levels.
+        Levels get no SH bands beyond the base's: as many bytes of further splats are worth more, and what streams levels takes one degree only.
         """
         return {"recipe": self.recipe, "viewer": self.viewer, "most_sh_degree": 0, **settings, **self.settings}
 

@@ -64,7 +64,7 @@ def distances(manifest: dict[str, Any], canvas: int) -> list[float]:
 
 @dataclass(frozen=True, eq=False)
 class Approach:
-    """How far away the chunks of a scene are for PlayCanvas when a camera looks at the scene's middle, from any direction."""
+    """How far away the boxes of a scene are when a camera looks at the scene's middle, from any direction: chunks, or a tile."""
 
     middle: Tensor  # [3] world units
     low: Tensor  # [C, 3], of the boxes that distances are measured to
@@ -78,6 +78,11 @@ class Approach:
         splats = torch.tensor([chunk.splats[0] for chunk in chunks], dtype=torch.float64)
         return cls(middle.double(), *shrunk(low, high), splats)
 
+    @classmethod
+    def to_box(cls, middle: Tensor, low: Tensor, high: Tensor) -> Approach:
+        """To the `middle` [3] in a single box between two corners [3], world units."""
+        return cls(middle.double(), low.double()[None], high.double()[None], torch.ones(1, dtype=torch.float64))
+
     def chunk_distance(self, distance: float) -> float:
         """The distance of the chunks from a camera so far from the middle, world units: the median over splats and directions."""
         eyes = self.middle + distance * DIRECTIONS
@@ -85,6 +90,10 @@ class Approach:
         rising, order = away.flatten().sort()
         reached = self.splats.expand(len(eyes), -1).flatten()[order].cumsum(0)
         return float(rising[int(torch.searchsorted(reached, reached[-1] / 2))])
+
+    def near(self, distance: float) -> float:
+        """`chunk_distance`, but at least half of the distance: a camera may be inside the boxes of splats far away."""
+        return max(self.chunk_distance(distance), distance / 2)
 
     def camera_distance(self, distance: float) -> float:
         """The distance from the middle at which `chunk_distance` is this."""
@@ -121,8 +130,7 @@ def viewer_settings(manifest: dict[str, Any], approach: Approach | None, canvas:
         multiplier = max(manifest["lodMultiplier"], LEAST_MULTIPLIER)
         shown = [base * multiplier**number for number in range(len(rising))]
     else:
-        near = [max(approach.chunk_distance(distance), distance / 2) for distance in rising]
-        base, multiplier = progression(near, scales[0] / scales[1])
+        base, multiplier = progression([approach.near(distance) for distance in rising], scales[0] / scales[1])
         shown = [approach.camera_distance(base * multiplier**number) for number in range(len(rising))]
     return {
         "lodBaseDistance": base,
@@ -151,11 +159,11 @@ def write_streamed(folder: Path, canvas: int = CANVAS) -> Path:
         extent = manifest.get("chunk_extent", max(1, round(EXTENT * rising[0])))
         files = [level["file"] for level in manifest["levels"]]
         write_streamed_sog([readable(folder / file, Path(copies, file)) for file in files], made, extent)
-        approach = None if manifest.get("by") == "distance" else _approach(folder / files[0], made)
+        approach = None if manifest.get("by") == "distance" else Approach.to(middle_of(folder / files[0]), read_chunks(made))
         write_json(temporary / SETTINGS, viewer_settings(manifest, approach, canvas), overwrite=False)
     return folder / STREAMED / LOD_META
 
 
-def _approach(finest: Path, made: Path) -> Approach:
-    """To the middle of the finest level's splats."""
-    return Approach.to(load_model(finest).parameters()["means"].detach().median(dim=0).values, read_chunks(made))
+def middle_of(finest: Path) -> Tensor:
+    """The middle [3] of the finest level's splats, world units."""
+    return load_model(finest).parameters()["means"].detach().median(dim=0).values

@@ -1,7 +1,8 @@
 """3D Tiles for Cesium and others: a tile for each level, of which the coarser is replaced by the finer where its error would be visible.
 
-A tile is replaced when its geometric error, seen from the camera, has more than 16 px (Cesium's `maximumScreenSpaceError`). A level should
-be replaced at the zoom z of its switch, at which a base pixel of size p is 1 / z times as large as a pixel: its error is 16 · p / z.
+A tile is replaced when its geometric error, seen from the nearest point of its box, has more than 16 px (Cesium's `maximumScreenSpaceError`). A
+level should be replaced at the zoom z of its switch, at which a base pixel of size p is 1 / z times as large as a pixel: its error is 16 · p / z,
+times the distance of the box over that of the splats. One box holds all splats, those far away too, so that it begins long before most of them.
 
 Cesium draws the splats of a glTF only if they are SPZ, by KHR_gaussian_splatting_compression_spz_2, and only if the tileset requires both
 extensions; it takes others for points, whose shader does not compile, and stops (1.145: GaussianSplat3DTileContent, GltfLoader). It also
@@ -13,7 +14,7 @@ from __future__ import annotations
 import gzip
 import shutil
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -29,7 +30,8 @@ from mipmap_plugin.formats.glb import FLOAT, before_binary
 from mipmap_plugin.formats.gltf import SPLATTING, SPZ_INSIDE
 from mipmap_plugin.formats.splat_transform import write_exchange
 from mipmap_plugin.levels.exported import readable
-from mipmap_plugin.levels.manifest import read_manifest
+from mipmap_plugin.levels.manifest import CANVAS, read_manifest
+from mipmap_plugin.levels.streamed import Approach, distances, middle_of
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.outputs import cut_off, refuse_far
@@ -56,15 +58,21 @@ BYTE = 5121  # glTF 2.0's code of that type of numbers
 REACH = 3.0
 
 
-def errors(manifest: dict[str, Any]) -> list[float]:
-    """The geometric error of each level in world units, from the finest, whose error is 0."""
-    return [0.0, *(SCREEN_ERROR * manifest["base_pixel"] / switch["zoom"] for switch in manifest["switches"])]
+def errors(manifest: dict[str, Any], approach: Approach | None, canvas: int) -> list[float]:
+    """The geometric error of each level in world units, from the finest, whose error is 0.
+
+    `approach`: to the box of all levels; None for a ladder by distance, whose levels are made for distances from boxes. `canvas`: its shorter side in
+    px, on which the camera's distance depends.
+    """
+    away, pixels = distances(manifest, canvas), [manifest["base_pixel"] / switch["zoom"] for switch in manifest["switches"]]
+    nearness = [approach.near(distance) / distance if approach else 1.0 for distance in away]
+    return [0.0, *(SCREEN_ERROR * pixel * near for pixel, near in zip(pixels, nearness, strict=True))]
 
 
-def tileset(manifest: dict[str, Any], box: list[float]) -> dict[str, Any]:
-    """The tileset of a ladder within `box`, whose levels are level_0.glb, level_1.glb, ..."""
+def tileset(box: list[float], errors: Sequence[float]) -> dict[str, Any]:
+    """The tileset of levels within `box` that have these errors: level_0.glb, level_1.glb, ..."""
     tile: dict[str, Any] = {}
-    for number, error in enumerate(errors(manifest)):
+    for number, error in enumerate(errors):
         content = {"uri": f"level_{number}.glb"}
         finer = {"children": [tile]} if tile else {}
         tile = {"boundingVolume": {"box": box}, "geometricError": error, "refine": "REPLACE", "content": content, **finer}
@@ -74,10 +82,14 @@ def tileset(manifest: dict[str, Any], box: list[float]) -> dict[str, Any]:
     return {"asset": {"version": "1.1"}, **said, "geometricError": farthest, "root": tile}
 
 
-def bounding_box(levels: Iterable[SplatModel]) -> list[float]:
-    """The box around all splats of all levels (merged ones reach farther), as 3D Tiles write it: its center, then half of each of its axes."""
+def bounds(levels: Iterable[SplatModel]) -> tuple[Tensor, Tensor]:
+    """The lowest and the highest corner [3] of the box around all splats of all levels (merged ones reach farther)."""
     lows, highs = zip(*(_bounds(model) for model in levels), strict=True)
-    low, high = torch.stack(lows).amin(dim=0), torch.stack(highs).amax(dim=0)
+    return torch.stack(lows).amin(dim=0), torch.stack(highs).amax(dim=0)
+
+
+def bounding_box(low: Tensor, high: Tensor) -> list[float]:
+    """The box between two corners [3], as 3D Tiles write it: its center, then half of each of its axes."""
     center, half = (each[list(AXES)] for each in ((low + high) / -2, (high - low) / 2))
     return [*center.tolist(), *torch.diag(half).flatten().tolist()]
 
@@ -120,15 +132,17 @@ def glb(spz: bytes, low: list[float], high: list[float]) -> bytes:
     return before_binary(document, len(binary)) + binary
 
 
-def write_tiles(folder: Path) -> Path:
-    """Write 3D Tiles to the subfolder `tiles` of a ladder; return its tileset.json.
+def write_tiles(folder: Path, canvas: int = CANVAS) -> Path:
+    """Write 3D Tiles to the subfolder `tiles` of a ladder; return its tileset.json. `canvas`: its shorter side in px.
 
     Raises SettingsError without splat-transform, OutputExists, OutputError.
     """
     manifest = read_manifest(folder)
-    box = bounding_box(load_model(folder / level["file"]) for level in manifest["levels"])
+    files = [folder / level["file"] for level in manifest["levels"]]
+    low, high = bounds(map(load_model, files))
+    approach = None if manifest.get("by") == "distance" else Approach.to_box(middle_of(files[0]), low, high)
     with new_folder(folder / TILES, overwrite=False) as temporary:
-        for number, level in enumerate(manifest["levels"]):
-            write_tile(folder / level["file"], temporary / f"level_{number}.glb")
-        write_json(temporary / TILESET, tileset(manifest, box), overwrite=False)
+        for number, file in enumerate(files):
+            write_tile(file, temporary / f"level_{number}.glb")
+        write_json(temporary / TILESET, tileset(bounding_box(low, high), errors(manifest, approach, canvas)), overwrite=False)
     return folder / TILES / TILESET

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -73,8 +74,9 @@ def lead(manifest: dict[str, Any], where: str) -> str:
     """What came out. `where`: what the curve is over."""
     levels, curve = manifest["levels"], manifest["curve"]
     splats, size = (sum(level[of] for level in levels) for of in ("splats", "bytes"))
-    base = min(point["base_db"] for point in curve)
+    base = [point["base_db"] for point in curve]
     return (
         f"{plural(len(levels), 'level')} for {manifest['viewer']}, {plural(splats, 'splat')}, {size_in_bytes(size)}: {where} at worst "
-        f"{manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} dB on average; the base alone falls to {base:.1f} dB."
+        f"{manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} dB on average; the base alone: at worst {min(base):.1f} dB, "
+        f"{fmean(base):.1f} dB on average."
     )

@@ -15,7 +15,7 @@ import torch
 from browser import HERE
 
 from mipmap_plugin.formats.splat_transform import TOOL, find_tool
-from mipmap_plugin.levels.tiles import bounding_box, write_tile
+from mipmap_plugin.levels.tiles import bounding_box, bounds, write_tile
 from mipmap_plugin.models.vanilla import VanillaModel
 
 pytestmark = pytest.mark.browser
@@ -45,7 +45,7 @@ def test_the_box_is_where_splat_transform_puts_the_splats(tmp_path, monkeypatch)
     model = VanillaModel.from_gaussians(replace(ball, means=ball.means * torch.tensor([1.0, 2.0, 4.0]) + offset))
     model.save(tmp_path / "base.ply", provenance={})
     write_tile(tmp_path / "base.ply", tmp_path / "base.glb")
-    found, box = positions(tmp_path / "base.glb"), bounding_box([model])
+    found, box = positions(tmp_path / "base.glb"), bounding_box(*bounds([model]))
     for axis in range(3):
         center, half = box[axis], box[3 + 4 * axis]
         low, high = found[:, axis].min(), found[:, axis].max()

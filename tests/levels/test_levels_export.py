@@ -21,7 +21,7 @@ from mipmap_plugin.formats.streamed_sog import read_chunks
 from mipmap_plugin.levels.exported import readable
 from mipmap_plugin.levels.manifest import MANIFEST
 from mipmap_plugin.levels.streamed import EXTENT, Approach, distances, viewer_settings, write_streamed
-from mipmap_plugin.levels.tiles import bounding_box, tileset, write_tile, write_tiles
+from mipmap_plugin.levels.tiles import bounding_box, bounds, tileset, write_tile, write_tiles
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.vanilla import VanillaModel
 
@@ -104,7 +104,7 @@ def test_the_box_of_a_tile_holds_the_large_splats_of_coarser_levels_too(ladder, 
     coarse = VanillaModel.from_gaussians(replace(fine, scales=3 * fine.scales))
     coarse.save(ladder / "level_2.ply", provenance={}, overwrite=True)
     root = json.loads(write_tiles(ladder).read_text())["root"]
-    assert root["boundingVolume"]["box"] == pytest.approx(bounding_box([coarse]), abs=1e-5)
+    assert root["boundingVolume"]["box"] == pytest.approx(bounding_box(*bounds([coarse])), abs=1e-5)
     assert root["content"]["uri"] == "level_2.glb"
 
 
@@ -186,7 +186,7 @@ def test_what_it_reads_is_a_level_without_these_bands(tmp_path):
 
 
 def test_cesium_is_told_in_the_tileset_that_tiles_are_splats():
-    assert tileset(LADDER, [0.0] * 12)["extensions"]["3DTILES_content_gltf"]["extensionsRequired"] == [
+    assert tileset([0.0] * 12, [0.0])["extensions"]["3DTILES_content_gltf"]["extensionsRequired"] == [
         "KHR_gaussian_splatting",
         "KHR_gaussian_splatting_compression_spz_2",
     ]
@@ -257,8 +257,8 @@ def test_without_splat_transform_the_command_says_so_before_any_work(tmp_path, m
 
 def test_a_canvas_without_distances_to_compute_is_refused(tmp_path, capsys):
     words = ["levels", str(tiny.ply(tmp_path / "base.ply")), "--viewer", "playcanvas", "--output", str(tmp_path / "ladder")]
-    assert cli.main([*words, "--tiles", "--canvas", "2160"]) == 2
-    assert "--canvas is for the distances of Streamed SOG; give --streamed-sog too" in capsys.readouterr().err
+    assert cli.main([*words, "--canvas", "2160"]) == 2
+    assert "--canvas is for the distances of Streamed SOG and 3D Tiles; give --streamed-sog or --tiles" in capsys.readouterr().err
 
 
 def test_levels_below_the_db_that_were_asked_for_are_named():

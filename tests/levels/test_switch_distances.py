@@ -8,8 +8,9 @@ import torch
 from two_levels import CHUNKS, LADDER
 
 from mipmap_plugin.formats.streamed_sog import Chunk
-from mipmap_plugin.levels.streamed import Approach, distances, progression, viewer_settings
-from mipmap_plugin.levels.tiles import SCREEN_ERROR, bounding_box, errors, tileset
+from mipmap_plugin.levels.distance.chunks import box_distances
+from mipmap_plugin.levels.streamed import DIRECTIONS, Approach, distances, progression, viewer_settings
+from mipmap_plugin.levels.tiles import SCREEN_ERROR, bounding_box, bounds, errors, tileset
 
 APPROACH = Approach.to(torch.tensor([2.0, 0.5, 0.5]), CHUNKS)
 
@@ -65,13 +66,29 @@ def test_what_playcanvas_takes_for_levels_by_distance_of_a_scene_in_small_units_
 
 
 def test_a_tile_is_replaced_at_its_switch():
-    """Seen at the zoom 0.7, a base pixel of 0.01 units has 0.7 px, so that the error of the tile that is replaced there has 16."""
-    assert errors(LADDER)[0] == 0
-    assert [error / 0.01 * zoom for error, zoom in zip(errors(LADDER)[1:], (0.7, 0.35), strict=True)] == pytest.approx([SCREEN_ERROR] * 2)
+    """Where a base pixel of 0.01 units at the scene's middle is seen with 0.7 px, the error of the tile that is replaced there has 16 at its box."""
+    focal, box = 500 / math.tan(math.radians(22.5)), (torch.tensor([-3.0, -4.0, -5.0]), torch.tensor([3.0, 4.0, 5.0]))
+    approach = Approach.to_box(torch.zeros(3), *box)
+    finest, *coarser = errors(LADDER, approach, 1000)
+    assert finest == 0
+    for error, zoom in zip(coarser, (0.7, 0.35), strict=True):
+        eyes = focal * 0.01 / zoom * DIRECTIONS
+        away = box_distances(box[0].double()[None], box[1].double()[None], eyes)
+        assert float((focal * error / away).median()) == pytest.approx(SCREEN_ERROR, rel=0.02)
+
+
+def test_a_tile_that_reaches_far_beyond_its_scene_is_replaced_all_the_same():
+    """A camera inside the box is at no distance from it, at which Cesium would never show a coarser level."""
+    approach = Approach.to_box(torch.zeros(3), torch.full((3,), -1e3), torch.full((3,), 1e3))
+    assert errors(LADDER, approach, 1000)[1:] == pytest.approx([SCREEN_ERROR * 0.01 / zoom / 2 for zoom in (0.7, 0.35)])
+
+
+def test_tiles_of_levels_by_distance_are_replaced_at_the_distance_of_their_box():
+    assert errors(LADDER, None, 1000) == pytest.approx([0, *(SCREEN_ERROR * 0.01 / zoom for zoom in (0.7, 0.35))])
 
 
 def test_tiles_go_from_the_coarsest_to_the_finest():
-    made = tileset(LADDER, [0.0] * 12)
+    made = tileset([0.0] * 12, [0.0, 1.0, 2.0])
     tile, uris = made["root"], []
     while True:
         uris.append(tile["content"]["uri"])
@@ -85,7 +102,7 @@ def test_tiles_go_from_the_coarsest_to_the_finest():
 
 def test_the_box_holds_every_splat():
     """In the axes of a tile, where (x, y, z) of a PLY lies at (-x, -z, -y)."""
-    box, splats = bounding_box([tiny.model()]), tiny.gaussians()
+    box, splats = bounding_box(*bounds([tiny.model()])), tiny.gaussians()
     for axis, of_ply in enumerate((0, 2, 1)):
         center, half = box[axis], box[3 + 4 * axis]
         assert float(-splats.means[:, of_ply].max()) > center - half and float(-splats.means[:, of_ply].min()) < center + half
