@@ -274,7 +274,7 @@ class FrozenBase:
     def viewpoints(self) -> Viewpoints:
         """Where views without cameras are. Raises SettingsError without splats."""
         clear = ClearViews(self.model, partial(choose_backend, self._backend, self._needs), self.effects())
-        return Viewpoints(orbit_of(self.model, self.trained.up), clear)
+        return Viewpoints(orbit_of(self.model, self.trained.up, lone=not self.cameras), clear)
 
     def refuse_undrawn(self, views: Sequence[Camera] | None = None, scale: float = 1.0) -> None:
         """Raise SettingsError if none of the views, by default the base's own, shows anything of it at `scale` (`refuse_blind`)."""

@@ -12,7 +12,8 @@ from mipmap_plugin.adaptation.viewpoints import Viewpoints
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError, plural
-from mipmap_plugin.scenes.orbits import GOLDEN, ORBIT_FOV
+from mipmap_plugin.scenes.orbits import ORBIT_FOV
+from mipmap_plugin.scenes.photographed import GOLDEN
 from mipmap_plugin.scenes.trajectories import jittered, with_company
 
 # A checkpoint without cameras does not say at what resolution it was trained: this many px across 50 degrees is NeRF-Synthetic's.
@@ -41,7 +42,8 @@ def choose_views(cameras: Sequence[Camera], viewpoints: Viewpoints, config: Adap
         orbit, count = viewpoints.orbit, config.extra_views or ORBIT_VIEWS
         views = viewpoints.views((pixels, pixels), count, generator)
         reason = "as requested" if cameras else "the checkpoint came without cameras"
-        told = f" {orbit.told()}," if orbit.up else ""
+        told = f" {orbit.told()}," if orbit.up or orbit.seen else ""
+        pixels = max(min(view.size) for view in views)
         return views, f"{plural(len(views), 'view')} of a generated orbit{told} at {pixels} px ({reason})"
     if config.views == "given":
         return list(cameras), f"the {plural(len(cameras), 'given view')}"

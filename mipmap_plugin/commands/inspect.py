@@ -117,7 +117,8 @@ def _seen_by(wrapped: Wrapped, given: Path | None) -> str:
         return f"{own}, of its base, in {place}" if place else own
     unread, orbit = unread_cameras(wrapped.model.source), wrapped.viewpoints.orbit
     none = f"none are read; {unread} may be of this scene" if unread else "none beside the checkpoint"
-    return f"{none}; {f'it is looked at {orbit.told()}' if orbit.up else 'give the scene (--cameras), or say what is up (--up z, for one)'}"
+    told = orbit.up or orbit.seen
+    return f"{none}; {f'it is looked at {orbit.told()}' if told else 'give the scene (--cameras), or say what is up (--up z, for one)'}"
 
 
 def _verdict(wrapped: Wrapped, advice: str, health: Sequence[str], spoilt: bool, unseen: str) -> str:

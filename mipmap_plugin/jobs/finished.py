@@ -25,6 +25,7 @@ from mipmap_plugin.formats.splat_transform import WRITTEN
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.models import detect, load_model
+from mipmap_plugin.models.adapted_scale import orbit_in
 from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes.orbits import Orbit
@@ -88,18 +89,19 @@ def _is_of_inputs(provenance: dict[str, Any], job: Job) -> bool:
     cameras = job.base.own_cameras()
     photographs = {} if job.images is None else {"photographs": job.base.photographs(job.images).digest()}
     inputs = job.base.asked(cameras) | photographs | network_input(job.config().upsampler)
-    return provenance.get("inputs") == inputs and _fits(provenance["settings"]["resize"], cameras, job)
+    return provenance.get("inputs") == inputs and _fits(provenance, cameras, job)
 
 
-def _fits(resize: str, cameras: Sequence[Camera], job: Job) -> bool:
-    """Whether `fitting` may have chosen a filter: of a zoom-in it depends on the base's screen filter, which only loading the base might tell."""
+def _fits(provenance: dict[str, Any], cameras: Sequence[Camera], job: Job) -> bool:
+    """Whether `fitting` may have chosen the file's filter: of a zoom-in it depends on the base's screen filter, which only loading might tell."""
     if (config := job.config()).resize != "fitting":
         return True
-    somewhere = Viewpoints(Orbit((0.0, 0.0, 0.0), None, 1.0), list)  # the size of views does not depend on it
+    recorded = orbit_in(provenance)  # on it depends the size of its views
+    somewhere = Viewpoints(Orbit(**recorded) if recorded else Orbit((0.0, 0.0, 0.0), None, 1.0), list)
     as_large = {"extra_views": 1, "views": "train" if config.views == "jittered" else config.views}
     views, _ = choose_views(cameras if job.images is None else (), somewhere, config.model_copy(update=as_large))
     drawn = ("classic", "antialiased") if job.base.screen_filter is None else (job.base.screen_filter,)
-    return resize in [fitting(config, Effects(screen_filter=name), views, job.scale).resize for name in drawn]
+    return provenance["settings"]["resize"] in [fitting(config, Effects(screen_filter=name), views, job.scale).resize for name in drawn]
 
 
 def _digest(job: Job, wanted: Any, may_load: bool) -> str:

@@ -30,7 +30,7 @@ from mipmap_plugin.levels.distance.chunks import box_distances, shrunk
 from mipmap_plugin.levels.exported import readable
 from mipmap_plugin.levels.manifest import CANVAS, read_manifest
 from mipmap_plugin.models import load_model
-from mipmap_plugin.scenes.orbits import GOLDEN
+from mipmap_plugin.scenes.photographed import GOLDEN
 
 STREAMED, SETTINGS = "streamed", "playcanvas.json"
 

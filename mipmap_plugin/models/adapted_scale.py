@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -38,12 +39,23 @@ def adapted_orbit(source: Path | None) -> dict[str, Any] | None:
 
     Raises as `adapted_scale`.
     """
-    match _record(source).get("orbit"):
+    return orbit_in(_record(source))
+
+
+def orbit_in(record: dict[str, Any]) -> dict[str, Any] | None:
+    """The orbit in what an adapted file records, by the fields of `Orbit`; None if there is none."""
+    match record.get("orbit"):
         case {"center": [float(), float(), float()] as center, "up": [float(), float(), float()] | None as up, "distance": float() as far, **more}:
             nearest = more.get("nearest")
             known = {"center": tuple(center), "up": up and tuple(up), "distance": far, "said": more.get("said") is True}
-            return known | ({"nearest": nearest} if isinstance(nearest, float) else {})
+            return known | ({"nearest": nearest} if isinstance(nearest, float) else {}) | _photographed(more.get("seen"), more.get("focal"))
     return None
+
+
+def _photographed(seen: Any, focal: Any) -> dict[str, Any]:
+    """From where a capture was photographed, of a record that tells it in full."""
+    told = isinstance(seen, str) and re.fullmatch("[0-9a-f]{1,64}", seen) and int(seen, 16) and isinstance(focal, float) and focal > 0
+    return {"seen": seen, "focal": focal} if told else {}
 
 
 def known_up(source: Path | None, by_family: tuple[float, float, float] | None) -> tuple[float, float, float] | None:

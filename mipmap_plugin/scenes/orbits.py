@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -14,6 +14,7 @@ from mipmap_plugin.camera import Camera, viewmat_of
 from mipmap_plugin.effects import NEAR_PLANE
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.scenes.photographed import GOLDEN, photographed, seen_ways
 
 ORBIT_FOV = math.radians(50)  # along the shorter side: a normal lens
 
@@ -34,6 +35,7 @@ WHOLE, TIGHT = 0.995, 1.4
 # show this size, the others at NEARER of it, but none is within the MIDDLE of the splats. Adapted to views that frame all splats, from up to 15 times
 # as far away as the cameras, a bird and flowers look worse than their bases from where they were photographed.
 INNER, SHARP_PX, NEARER, MIDDLE = 1 / 2, 2.0, 1 / 2, 1 / 4
+FARTHER = 1.6  # of where the colors tell of (`where_photographed`): half of the views are farther, as it tells too near and too far by that
 SHARP_FOCAL = 400 / math.tan(ORBIT_FOV / 2)  # of pictures of 800 px
 SEEN_OPACITY = 0.1
 
@@ -48,15 +50,14 @@ AXES = {
     "x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0), "-x": (-1.0, 0.0, 0.0), "-y": Y_DOWN, "-z": (0.0, 0.0, -1.0),
 }  # fmt: skip
 
-# Places at multiples of the golden ratio are spread evenly, however many there are.
-GOLDEN = (math.sqrt(5) - 1) / 2
-
 
 @dataclass(frozen=True)
 class Orbit:
     """What an orbit goes around, in world units: `center`, the vertical `up` (None: not known), and how far away its cameras are.
 
     `nearest`: how far half of them are, if that is not the same (0).
+    `seen`: in which directions a capture was photographed, as its colors tell (`photographed`), and `focal`: the focal length (px) of pictures
+    from `nearest`. Without them ("", 0) all directions count, and pictures have the size that is asked for.
     `said`: the user or the base's files say what is up; otherwise it is guessed from the splats (`guess_up`).
     """
 
@@ -65,6 +66,8 @@ class Orbit:
     distance: float
     said: bool = False
     nearest: float = 0.0
+    seen: str = ""
+    focal: float = 0.0
 
     @classmethod
     def around(cls, means: Tensor, up: Sequence[float] | None = None, sharp: Callable[[], float] = lambda: math.inf) -> Orbit:
@@ -85,8 +88,20 @@ class Orbit:
         vertical = guess_up(means) if up is None else (up[0], up[1], up[2])
         return cls((x, y, z), vertical, distance, nearest=nearest)
 
+    def where_photographed(self, splats: Gaussians) -> Orbit:
+        """The orbit of a capture, from where the colors of its splats tell that it was photographed; the same if they do not tell."""
+        center = torch.tensor(self.center, dtype=torch.float64)
+        away = (_finite(splats.means) - center).norm(dim=1)
+        outside, framing = max(_quantile(away, MIDDLE).item(), 2 * NEAR_PLANE), _quantile(away, FRAMED).item() / math.sin(ORBIT_FOV / 2)
+        found = photographed(splats, center, outside, max(outside, framing), ORBIT_FOV / 2)
+        if found is None:
+            return self
+        return replace(self, distance=FARTHER * found.distance, nearest=found.distance, seen=found.seen, focal=found.focal)
+
     def told(self) -> str:
-        """From where its views look, in words."""
+        """From where its views look, in words; "" from all around."""
+        if self.seen:
+            return "from where its colors tell that it was photographed"
         if self.up is None:
             return "from all around"
         name = next((name for name, axis in AXES.items() if axis == self.up), f"({', '.join(f'{part:.3g}' for part in self.up)})")
@@ -101,13 +116,22 @@ class Orbit:
             raise SettingsError(f"an orbit needs views, but got {count}")
         center, vertical = (torch.tensor(vector, dtype=torch.float64) for vector in (self.center, self.up or Y_DOWN))
         vertical = vertical / vertical.norm()
-        guessed = self.up is not None and not self.said
-        elevations = HANDHELD if guessed else ABOVE if self.said else ALL
-        directions = (_sky_directions if guessed else _spiral)(vertical, elevations, count, generator)
+        directions = self._ways(vertical, count, generator)
         # Two far, two near: if all views of one part of the turn were near, these would be on one side only, and if every other view were, all of
         # them would be in the same half of the validation views.
         far = [self.distance if i // 2 % 2 == 0 else self.nearest or self.distance for i in range(count)]
-        return [_looking_at(center, center + far[i] * way, vertical, size, f"orbit_{first + i:04d}") for i, way in enumerate(directions)]
+        focals = [self.focal * each / self.nearest if self.focal else None for each in far]  # of pictures that show the middle in the same detail
+        return [
+            _looking_at(center, center + far[i] * way, vertical, size, f"orbit_{first + i:04d}", focals[i]) for i, way in enumerate(directions)
+        ]
+
+    def _ways(self, vertical: Tensor, count: int, generator: torch.Generator) -> Tensor:
+        """The directions of `count` cameras, unit vectors [count, 3], with `vertical` (unit) upwards."""
+        if self.seen:
+            return seen_ways(self.seen, count, generator)
+        guessed = self.up is not None and not self.said
+        elevations = HANDHELD if guessed else ABOVE if self.said else ALL
+        return (_sky_directions if guessed else _spiral)(vertical, elevations, count, generator)
 
 
 def orbit(
@@ -184,14 +208,18 @@ def _directions(up: Tensor, turns: Tensor, height: Tensor) -> Tensor:
     return (1 - height**2).sqrt() * (azimuth.cos() * east + azimuth.sin() * north) + height * up
 
 
-def _looking_at(target: Tensor, eye: Tensor, up: Tensor, size: tuple[int, int], name: str) -> Camera:
-    """A camera at `eye` that looks at `target`, with `up` upwards. The columns of its rotation are right, down and forward."""
+def _looking_at(target: Tensor, eye: Tensor, up: Tensor, size: tuple[int, int], name: str, focal: float | None = None) -> Camera:
+    """A camera at `eye` that looks at `target`, with `up` upwards. The columns of its rotation are right, down and forward.
+
+    `focal`, px: by default that with which a picture of this `size` shows `ORBIT_FOV`. A picture that would show more is smaller.
+    """
     forward = (target - eye) / (target - eye).norm()
     right = torch.linalg.cross(forward, up)
     right = right / right.norm()
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1)
-    height, width = size
-    focal = min(size) / (2 * math.tan(ORBIT_FOV / 2))
+    usual = min(size) / (2 * math.tan(ORBIT_FOV / 2))
+    focal = usual if focal is None else focal
+    height, width = (max(1, round(side * min(1.0, focal / usual))) for side in size)
     return Camera(width, height, focal, focal, width / 2, height / 2, viewmat_of(rotation, eye), name)
 
 

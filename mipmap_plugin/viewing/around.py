@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera, evenly, viewmat_of
 from mipmap_plugin.models.base import places
-from mipmap_plugin.scenes.orbits import GOLDEN
+from mipmap_plugin.scenes.photographed import GOLDEN
 from mipmap_plugin.scenes.trajectories import rotation_matrix
 from mipmap_plugin.viewing.screen import inside
 from mipmap_plugin.wrap import Wrapped

@@ -26,7 +26,7 @@ from mipmap_plugin.levels.distance.walks import backed, focal_of, foreground
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.recipes import recipe as make_config
-from mipmap_plugin.scenes.orbits import GOLDEN
+from mipmap_plugin.scenes.photographed import GOLDEN
 
 # The settings of a zoom-out end here; at x1 nothing would be merged.
 BELOW_1 = 1 - 1e-3

@@ -1,0 +1,133 @@
+"""From where a capture was photographed, as view-dependent colors tell that were trained toward its cameras alone."""
+
+import json
+import math
+from dataclasses import asdict, replace
+
+import pytest
+import torch
+
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.adapted_scale import orbit_in
+from mipmap_plugin.scenes.orbits import FARTHER, ORBIT_FOV, Orbit
+from mipmap_plugin.scenes.photographed import CONTRAST, LEAST, SMALLEST, agreement, even_directions, photographed, seen_ways
+from mipmap_plugin.splatting.harmonics import basis
+
+COUNT, FAR = 1500, 6.0
+CENTER = torch.zeros(3, dtype=torch.float64)
+
+
+def draws(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def cameras() -> torch.Tensor:
+    """Places [C, 3] on the half of a ring around the scene, a little above it."""
+    turn = torch.linspace(0, math.pi, 24, dtype=torch.float64)
+    return FAR * torch.nn.functional.normalize(torch.stack([turn.cos(), torch.full_like(turn, -0.2), turn.sin()], 1), dim=1)
+
+
+def table() -> torch.Tensor:
+    """Places of splats [N, 3]: most on a table, a tenth far behind it."""
+    means = 4 * torch.rand(COUNT, 3, generator=draws(0), dtype=torch.float64) - 2
+    means[: COUNT // 10] *= 10
+    return means
+
+
+def capture() -> Gaussians:
+    """Splats whose colors are noise that was fitted toward the cameras: what steps of gradient descent from 0 can make of their bands."""
+    means = table()
+    rays = torch.nn.functional.normalize(means - cameras()[:, None], dim=2)
+    noise = torch.randn(len(cameras()), COUNT, 3, generator=draws(1), dtype=torch.float64)
+    sh = torch.einsum("vnk,vnc->nkc", basis(rays.flatten(0, 1), 3).unflatten(0, rays.shape[:2]), noise) / 100
+    sizes = 0.01 + 0.09 * torch.rand(COUNT, 1, generator=draws(2), dtype=torch.float64)
+    turned = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(COUNT, 4)
+    return Gaussians(means, turned, sizes.expand(COUNT, 3), torch.full((COUNT,), 0.8, dtype=torch.float64), sh)
+
+
+def by_chance(splats: Gaussians) -> Gaussians:
+    return replace(splats, sh=torch.randn(splats.sh.shape, generator=draws(3), dtype=torch.float64))
+
+
+def found(splats: Gaussians):
+    return photographed(splats, CENTER, 2.0, 40.0, ORBIT_FOV / 2)
+
+
+def test_colors_stand_out_where_the_cameras_were():
+    splats, eyes = capture(), cameras()
+    assert agreement(splats, eyes).min() > agreement(splats, -eyes).max()
+    assert agreement(splats, eyes).mean() > torch.stack([agreement(splats, far * eyes).mean() for far in (0.3, 4.0)]).max()
+
+
+def test_the_agreement_of_colors_by_chance_is_the_same_everywhere():
+    assert agreement(by_chance(capture()), FAR * even_directions()).std() < CONTRAST / 2
+
+
+def test_the_distance_of_the_cameras_is_found():
+    assert FAR / FARTHER < found(capture()).distance < FAR * FARTHER
+
+
+def test_the_directions_of_the_cameras_count_as_seen_and_those_across_do_not():
+    seen = found(capture()).seen
+    ways, nearest = seen_ways(seen, 400, draws(4)), cameras() / FAR
+    closest = (nearest @ ways.T).max(dim=1).values
+    assert closest.min() > math.cos(math.radians(15))
+    assert (ways @ -nearest[len(nearest) // 2]).max() < math.cos(math.radians(15))
+
+
+def test_the_smallest_splats_are_pixels_in_pictures_from_there():
+    splats = capture()
+    told = found(splats)
+    eyes = told.distance * seen_ways(told.seen, 200, draws(5))
+    depth = torch.stack([(splats.means - eye) @ -eye / told.distance for eye in eyes])
+    angle = depth / torch.stack([(splats.means - eye).norm(dim=1) for eye in eyes])
+    closest = torch.where(angle > math.cos(ORBIT_FOV / 2), depth, math.inf).amin(0)
+    pixels = splats.scales[:, 0] * told.focal / closest
+    assert (pixels[closest.isfinite()] < 1).double().mean() == pytest.approx(SMALLEST, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    "silent",
+    [
+        by_chance,
+        lambda splats: replace(splats, sh=splats.sh[:, :1]),
+        lambda splats: splats[: LEAST - 1],
+        lambda splats: replace(splats, sh=0 * splats.sh),
+    ],
+    ids=["chance", "degree 0", "few", "zero bands"],
+)
+def test_colors_that_do_not_tell_change_nothing(silent):
+    orbit = Orbit.around(table(), sharp=lambda: 0.01)
+    assert orbit.where_photographed(silent(capture())) is orbit
+
+
+def test_splats_that_are_not_finite_are_not_asked():
+    splats = capture()
+    broken = replace(splats, sh=splats.sh.clone(), means=splats.means.clone())
+    broken.sh[::7], broken.means[::11] = math.nan, math.inf
+    assert found(broken).distance == pytest.approx(found(splats).distance, rel=0.3)
+
+
+def test_views_are_where_the_colors_tell_half_of_them_farther_and_with_the_same_detail():
+    orbit = Orbit.around(table(), sharp=lambda: 0.01).where_photographed(capture())
+    views = orbit.views((10_000, 10_000), 40, draws(6))
+    center = torch.tensor(orbit.center, dtype=torch.float64)
+    far = torch.stack([view.center.double() - center for view in views]).norm(dim=1)
+    assert sorted({round(each, 6) for each in far.tolist()}) == [round(orbit.nearest, 6), round(FARTHER * orbit.nearest, 6)]
+    detail = [view.fx / float(each) for view, each in zip(views, far, strict=True)]
+    assert detail == pytest.approx([orbit.focal / orbit.nearest] * 40)
+    assert [view.width for view in views] == pytest.approx([2 * view.fx * math.tan(ORBIT_FOV / 2) for view in views], abs=1)
+
+
+def test_pictures_are_no_larger_than_asked_and_keep_their_detail():
+    orbit = Orbit.around(table(), sharp=lambda: 0.01).where_photographed(capture())
+    small, large = (orbit.views((side, 2 * side), 4, draws(7))[0] for side in (10, 10_000))
+    assert (small.height, small.width, small.fx) == (10, 20, pytest.approx(large.fx))
+
+
+def test_an_adapted_file_remembers_it():
+    orbit = Orbit.around(table(), sharp=lambda: 0.01).where_photographed(capture())
+    record = json.loads(json.dumps({"orbit": asdict(orbit)}))
+    assert Orbit(**orbit_in(record)) == orbit
+    for wrong in ({"seen": "xyz"}, {"seen": "0"}, {"seen": "f" * 65}, {"focal": -1.0}):
+        assert Orbit(**orbit_in({"orbit": record["orbit"] | wrong})) == replace(orbit, seen="", focal=0.0)
