@@ -57,7 +57,7 @@ def test_what_is_spent_is_there_until_the_output_is_and_not_after(tmp_path, monk
     kept, seen = {"out.resume", "out.tiles"}, set()
     for number in numbers(request):
         begin(out.parent, files, replaced)
-        if not killed(number, lambda: write(out, "new", files)):
+        if not killed(number, lambda: write(out, "new", files), out.parent):
             break
         text = text_of(settled(out))
         left = {path.name for path in out.parent.iterdir()} & kept
