@@ -268,7 +268,7 @@ SAMPLES: dict[str, Sample] = {
     "cameras.json": Sample(_folder, "cameras.json", ("of_json", *TEXT)),
     "exposure.json": Sample(_folder, "exposure.json", ("of_json", *TEXT)),
     "levels.json": Sample(_ladder, "levels.json", ("of_json", *TEXT), open=open_ladder),
-    "poses_bounds.npy": Sample(moving_captures.dynerf, "poses_bounds.npy", BINARY, is_scene=True),
+    "poses_bounds.npy": Sample(moving_captures.dynerf, "poses_bounds.npy", BINARY, open=lambda path: load_scene(path) and None),
     "dataset.json": Sample(moving_captures.hypernerf, "dataset.json", ("of_json", *TEXT), is_scene=True),
     "a camera of HyperNeRF": Sample(moving_captures.hypernerf, "camera/000001.json", ("of_json", *TEXT), is_scene=True),
     "transforms.json": Sample(_transforms, "transforms.json", ("of_json", "of_json", *TEXT), is_scene=True),
