@@ -26,7 +26,6 @@ from mipmap_plugin.formats.state_dict import read_state_dict
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.viewing.sources import open_source
 from mipmap_plugin.wrap import wrap_model
 
 
@@ -69,10 +68,6 @@ def open_placed(path: Path) -> None:
     """A checkpoint, and a scene seen in its frame."""
     model = load_model(path)
     assert model.as_trained(tiny.cameras(2), Capture())
-
-
-def open_ladder(path: Path) -> None:
-    open_source(path, wrap_model(path / "level_0.ply", backend="reference"), "reference")
 
 
 def open_state(path: Path) -> None:
@@ -193,12 +188,6 @@ def _adapted(path: Path) -> Path:
     return wrap_model(tiny.ply(path.with_name("base.ply")), cameras=tiny.cameras(2)).adapt(1 / 2, recipe="instant").save(path / "a.ply")
 
 
-def _ladder(path: Path) -> Path:
-    levels = [{"file": tiny.ply(path / f"level_{number}.ply", count=12).name, "shown_from": from_} for number, from_ in enumerate((0.5, None))]
-    (path / "levels.json").write_text(json.dumps({"by": "zoom", "levels": levels}))
-    return path
-
-
 def _anchors(layout: anchor_checkpoints.Layout) -> Callable[[Path], Path]:
     def make(path: Path) -> Path:
         anchor_checkpoints.write(path, layout, count=12)
@@ -267,7 +256,6 @@ SAMPLES: dict[str, Sample] = {
     "cfg_args of Octree-GS": Sample(_anchors(anchor_checkpoints.Layout("octree", united=True)), "cfg_args", OPTIONS),
     "cameras.json": Sample(_folder, "cameras.json", ("of_json", *TEXT)),
     "exposure.json": Sample(_folder, "exposure.json", ("of_json", *TEXT)),
-    "levels.json": Sample(_ladder, "levels.json", ("of_json", *TEXT), open=open_ladder),
     "poses_bounds.npy": Sample(moving_captures.dynerf, "poses_bounds.npy", BINARY, open=lambda path: load_scene(path) and None),
     "dataset.json": Sample(moving_captures.hypernerf, "dataset.json", ("of_json", *TEXT), is_scene=True),
     "a camera of HyperNeRF": Sample(moving_captures.hypernerf, "camera/000001.json", ("of_json", *TEXT), is_scene=True),
