@@ -21,11 +21,8 @@ from mipmap_plugin.formats import staging
 CALLS = {"open", "write", "flush", "close", "__exit__", "fsync", "truncate", "mkdir", "rmdir", "rename", "replace", "unlink", "remove", "flock"}
 CALLS |= {"sendfile", "copy_file_range", "symlink", "link", "utime", "chmod", "fchmod"}
 PLACES = {"posix", "_io", "io", "fcntl"}
-# By default one call in as many; no divisor of the calls that a file takes, so that in the end each kind has its turn.
+# By default one in as many, where each takes long; no divisor of the calls that a file takes, so that in the end each kind has its turn.
 FEW = 7
-
-# By default one state of the disk in as many, of which there are fewer.
-FEW_STATES = 3
 
 
 class Before:
@@ -80,6 +77,6 @@ def killed(number: int, job: Callable[[], Any], folder: Path, by: int = signal.S
     return status != 0
 
 
-def numbers(request: pytest.FixtureRequest, few: int = FEW_STATES) -> Iterator[int]:
-    """Of the calls to be broken off at: each in the slow tests, and else one in `few`, which is fast."""
-    return count(1, 1 if request.node.get_closest_marker("slow") else few)
+def some_of_the_calls(request: pytest.FixtureRequest) -> Iterator[int]:
+    """Of the calls to be broken off at: each in the slow tests, and else one in `FEW`, which is fast."""
+    return count(1, 1 if request.node.get_closest_marker("slow") else FEW)

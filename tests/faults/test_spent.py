@@ -5,11 +5,11 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-from itertools import product
+from itertools import count, product
 from unittest.mock import Mock
 
 import pytest
-from kill_points import killed, numbers
+from kill_points import killed
 
 from mipmap_plugin.errors import OutputError
 from mipmap_plugin.formats import staging
@@ -50,12 +50,12 @@ SLOW = [pytest.param(*case, marks=pytest.mark.slow) for case in product((0, 1, 2
 
 
 @pytest.mark.parametrize(("files", "replaced", "exchanges"), CASES + SLOW)
-def test_what_is_spent_is_there_until_the_output_is_and_not_after(tmp_path, monkeypatch, files, replaced, exchanges, request):
+def test_what_is_spent_is_there_until_the_output_is_and_not_after(tmp_path, monkeypatch, files, replaced, exchanges):
     if not exchanges:
         monkeypatch.setattr(staging, "exchange", lambda one, other: False)
     out = tmp_path / "place" / "out"
     kept, seen = {"out.resume", "out.tiles"}, set()
-    for number in numbers(request):
+    for number in count(1):
         begin(out.parent, files, replaced)
         if not killed(number, lambda: write(out, "new", files), out.parent):
             break
