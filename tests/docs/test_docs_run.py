@@ -100,9 +100,10 @@ def demo_scene(tmp_path_factory):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_views", "brief_ladders")
 @pytest.mark.parametrize("call", [call for call in CALLS if runs(call)], ids=str)
 def test_commands_run(call, demo_scene, tmp_path, monkeypatch, capsys):
-    """As they are written, but for as few steps and repetitions as there can be, and with a folder for each `DIR`."""
+    """As they are written, but for as few steps, views and repetitions as there can be, and with a folder for each `DIR`."""
     if "tradeoff" in call.text:
         pytest.importorskip("matplotlib")
     if {"--streamed-sog", "--tiles"} & set(call.text.split()) and "levels" in call.text and find_tool() is None:
