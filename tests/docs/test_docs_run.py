@@ -59,7 +59,7 @@ def test_a_wrong_name_is_found():
 NOT_RUN = {
     "view": "serves a page until Ctrl-C; tests/browser/test_live_view.py",
     "demo": "run by .ci/run and tests/demo/test_demo.py",
-    "--full": "several minutes; tests/hard has it",
+    "--full": "several minutes; tests/backends/test_conformance.py",
     "NAME": "stands for a name",
     "phone.spz": "splat-transform may not be installed",
     "SwinIR_x2.pth": "no network comes along",
