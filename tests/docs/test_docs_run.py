@@ -100,10 +100,12 @@ def demo_scene(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_views", "brief_ladders")
+@pytest.mark.usefixtures("brief_ladders")
 @pytest.mark.parametrize("call", [call for call in CALLS if runs(call)], ids=str)
-def test_commands_run(call, demo_scene, tmp_path, monkeypatch, capsys):
+def test_commands_run(call, demo_scene, tmp_path, monkeypatch, capsys, request):
     """As they are written, but for as few steps, views and repetitions as there can be, and with a folder for each `DIR`."""
+    if not {"--jobs", "--dask", "--tiles"} & set(call.text.split()):
+        request.getfixturevalue("few_views")  # of this process alone
     if "tradeoff" in call.text:
         pytest.importorskip("matplotlib")
     if {"--streamed-sog", "--tiles"} & set(call.text.split()) and "levels" in call.text and find_tool() is None:
