@@ -6,6 +6,7 @@ import base64
 import io
 from collections.abc import Sequence
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 import torch
@@ -37,6 +38,9 @@ TOGETHER = 2**18
 
 # What Pillow raises for a file that is not an image, a damaged one, a damaged PNG chunk and an absurd size.
 UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
+
+# What NumPy raises for a file that is not an array, or whose header, a line of Python, is damaged.
+NO_ARRAY = (OSError, ValueError, TypeError, SyntaxError, TokenError, OverflowError, RecursionError)
 
 
 def read_image(path: str | Path, background: Sequence[float], least: int | None = None) -> Tensor:
@@ -215,7 +219,7 @@ def read_array(path: str | Path) -> Tensor:
     """The numbers of a NumPy file, float64. Nothing is unpickled. Raises SceneError."""
     try:
         return torch.from_numpy(np.array(np.load(path, mmap_mode="r", allow_pickle=False), dtype=np.float64))
-    except (OSError, ValueError, TypeError, SyntaxError, OverflowError, RecursionError) as error:  # what NumPy raises for other files
+    except NO_ARRAY as error:
         raise SceneError(f"{path}: is not an array that NumPy reads ({brief(error)}); copy it again") from error
 
 

@@ -283,7 +283,11 @@ def _remove(path: Path, folder: Path) -> None:
 
 
 def _finish(folder: Path, lock: int) -> None:
-    if (folder / "ready").is_dir():
-        _move_in(folder)
-    _remove_spent(folder)
+    try:
+        if (folder / "ready").is_dir():
+            _move_in(folder)
+        _remove_spent(folder)
+    except BaseException:
+        os.close(lock)  # so that whoever writes or loads next finishes the moves, this process too, before something newer is there
+        raise
     release(folder, lock)

@@ -6,6 +6,7 @@ import gzip
 import json
 import math
 import re
+import sys
 import zipfile
 import zlib
 from collections.abc import Iterable
@@ -125,7 +126,7 @@ def provenance_of(comments: Iterable[str]) -> dict[str, Any] | None:
             try:
                 record: dict[str, Any] = json.loads(comment.removeprefix(PROVENANCE))
                 return record
-            except (json.JSONDecodeError, RecursionError):
+            except (ValueError, RecursionError):  # also an integer of more digits than Python reads
                 return None
     return None
 
@@ -140,7 +141,7 @@ def recorded_filter(comments: Iterable[str]) -> tuple[str, float] | None:
     size, name = record.get("kernel_size"), record.get("screen_filter", "mip")  # older versions record no name
     if not isinstance(name, str) or name not in SCREEN_FILTERS or mode != _MODES.get(_TAGS.get(name, "")):
         return None
-    return (name, float(size)) if isinstance(size, (int, float)) and size >= 0 else None
+    return (name, float(size)) if isinstance(size, (int, float)) and 0 <= size <= sys.float_info.max else None
 
 
 def _tag(comment: str) -> re.Match[str] | None:

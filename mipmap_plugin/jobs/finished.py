@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,9 @@ from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.errors import CheckpointError, SceneError
 from mipmap_plugin.formats.atomic import named, settled, sha256
+from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import WRITTEN
 from mipmap_plugin.formats.tags import provenance_of
@@ -49,8 +49,8 @@ def _outputs(target: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
     for path in reports:
         file = path.with_name(path.name.removesuffix(REPORT))
         try:
-            report = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            report = read_json(path)
+        except SceneError:
             continue
         if isinstance(report, dict) and file.is_file():
             yield file, report

@@ -12,6 +12,7 @@ from mipmap_plugin.formats.magic import kind_of, pickle_of, texts_in
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.tags import PROVENANCE, provenance_of, vertical_of
 from mipmap_plugin.formats.yaml_scalars import read_scalars
+from mipmap_plugin.limits import MAX_SCALE, MIN_SCALE
 from mipmap_plugin.models.places import REPORT, has_report
 
 # How the first comment of a PLY begins that `ns-export` of nerfstudio wrote, which spells itself so, or OpenSplat, and the project.
@@ -23,9 +24,9 @@ REMEDIES = {"nerfstudio": RUN, "gsplat": RUN, "OpenSplat": "give the cameras.jso
 
 
 def adapted_scale(source: Path | None) -> float | None:
-    """The scale that the file `source` was adapted to; None if it is a base. Raises CheckpointError, SceneError (`_record`)."""
+    """The scale that the file `source` was adapted to; None if none that can be, as of a base. Raises CheckpointError, SceneError (`_record`)."""
     scale = _record(source).get("scale")
-    return float(scale) if isinstance(scale, (int, float)) else None
+    return float(scale) if isinstance(scale, (int, float)) and MIN_SCALE <= scale <= MAX_SCALE else None
 
 
 def adapted_viewer(source: Path | None) -> str | None:

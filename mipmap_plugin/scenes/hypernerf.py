@@ -113,7 +113,7 @@ def _frame(file: Path) -> Tensor:
 
 def _of_capture(file: Path, name: str, split: Literal["train", "test"], time: float) -> Camera:
     """A camera of nerfies: world-to-camera rotation, position, and intrinsics, of which that project uses only the focal length."""
-    data = read_json(file)
+    data = _object(file)
     turn = rotation(present(data, "orientation", str(file)), f"{file}, orientation")
     eye = numbers(present(data, "position", str(file)), (3,), f"{file}, position")
     focal = positive(present(data, "focal_length", str(file)), f"{file}, focal_length")

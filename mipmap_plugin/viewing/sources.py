@@ -130,7 +130,7 @@ def open_source(path: Path, base: Wrapped, backend: str) -> Source:
 def _levels(folder: Path) -> list[tuple[float, str]]:
     """The zoom down to which each level of a ladder is shown, and its file."""
     by = found = None
-    with suppress(KeyError, TypeError, ValueError, AttributeError):
+    with suppress(KeyError, TypeError, ValueError, AttributeError, OverflowError):
         manifest = read_manifest(folder)
         by = manifest.get("by")
         found = [(float(entry["shown_from"] or 0.0), str(entry["file"])) for entry in manifest["levels"]]

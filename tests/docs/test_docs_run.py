@@ -59,7 +59,7 @@ def test_a_wrong_name_is_found():
 NOT_RUN = {
     "view": "serves a page until Ctrl-C; tests/browser/test_live_view.py",
     "demo": "run by .ci/run and tests/demo/test_demo.py",
-    "--full": "several minutes; tests/hard has it",
+    "--full": "several minutes; tests/backends/test_conformance.py",
     "NAME": "stands for a name",
     "phone.spz": "splat-transform may not be installed",
     "SwinIR_x2.pth": "no network comes along",
@@ -100,9 +100,12 @@ def demo_scene(tmp_path_factory):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("brief_ladders")
 @pytest.mark.parametrize("call", [call for call in CALLS if runs(call)], ids=str)
-def test_commands_run(call, demo_scene, tmp_path, monkeypatch, capsys):
-    """As they are written, but for as few steps and repetitions as there can be, and with a folder for each `DIR`."""
+def test_commands_run(call, demo_scene, tmp_path, monkeypatch, capsys, request):
+    """As they are written, but for as few steps, views and repetitions as there can be, and with a folder for each `DIR`."""
+    if not {"--jobs", "--dask", "--tiles"} & set(call.text.split()):
+        request.getfixturevalue("few_views")  # of this process alone
     if "tradeoff" in call.text:
         pytest.importorskip("matplotlib")
     if {"--streamed-sog", "--tiles"} & set(call.text.split()) and "levels" in call.text and find_tool() is None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
-from itertools import product
+from itertools import count, product
+from unittest.mock import Mock
 
 import pytest
-from kill_points import killed, numbers
+from kill_points import killed
 
 from mipmap_plugin.errors import OutputError
 from mipmap_plugin.formats import staging
@@ -48,14 +50,14 @@ SLOW = [pytest.param(*case, marks=pytest.mark.slow) for case in product((0, 1, 2
 
 
 @pytest.mark.parametrize(("files", "replaced", "exchanges"), CASES + SLOW)
-def test_what_is_spent_is_there_until_the_output_is_and_not_after(tmp_path, monkeypatch, files, replaced, exchanges, request):
+def test_what_is_spent_is_there_until_the_output_is_and_not_after(tmp_path, monkeypatch, files, replaced, exchanges):
     if not exchanges:
         monkeypatch.setattr(staging, "exchange", lambda one, other: False)
     out = tmp_path / "place" / "out"
     kept, seen = {"out.resume", "out.tiles"}, set()
-    for number in numbers(request):
+    for number in count(1):
         begin(out.parent, files, replaced)
-        if not killed(number, lambda: write(out, "new", files)):
+        if not killed(number, lambda: write(out, "new", files), out.parent):
             break
         text = text_of(settled(out))
         left = {path.name for path in out.parent.iterdir()} & kept
@@ -64,6 +66,19 @@ def test_what_is_spent_is_there_until_the_output_is_and_not_after(tmp_path, monk
         assert not [path.name for path in out.parent.iterdir() if path.name.startswith(".")]
         seen.add(text)
     assert len(seen) == 2 and text_of(out) == "new" and not {path.name for path in out.parent.iterdir()} & kept
+
+
+def test_moves_that_fail_are_finished_before_the_same_process_writes_anew(tmp_path, monkeypatch):
+    out = tmp_path / "place" / "out"
+    with monkeypatch.context() as dead:
+        dead.setattr(staging, "_move_in", lambda folder: None)
+        dead.setattr(staging.Staging, "close", lambda self: os.close(self._lock))
+        write(out, "of the killed run", 2)
+    with monkeypatch.context() as held, pytest.raises(OutputError, match="cannot be written"):
+        held.setattr(os, "replace", Mock(side_effect=PermissionError(errno.EACCES, "another program has it open")))
+        write(out, "new", 2)
+    write(out, "newest", 2)
+    assert text_of(settled(out)) == "newest" and {path.name for path in out.parent.iterdir()} == {"out", "out.json"}
 
 
 def test_what_another_run_has_put_there_since_is_not_taken_for_spent(tmp_path, monkeypatch):

@@ -60,7 +60,7 @@ def client(monkeypatch):
 def test_a_killed_worker_loses_one_job_which_is_resumed(start, tmp_path):
     start("scheduler", "--port", "0", "--no-dashboard")
     address = json.loads(wait_until(lambda: start.file.exists() and start.file.read_text()))["address"]
-    settings = {"steps": 1500, "seed": 0, "views": "given", "check_every": 5}
+    settings = {"steps": 600, "seed": 0, "views": "given", "check_every": 5}
     bases = [tiny.folder(tmp_path / f"base_{seed}", tiny.cameras(3), seed=seed) for seed in range(3)]
     jobs = [Job(Base(base, backend="reference"), tmp_path / f"{base.name}.ply", 0.5, recipe="paper", settings=settings) for base in bases]
     with ThreadPoolExecutor(1) as pool:

@@ -124,10 +124,11 @@ def test_other_options_of_the_training_are_not_finished(tmp_path):
     assert finished(job) is None
 
 
-def test_a_damaged_report_is_not_finished(tmp_path):
+@pytest.mark.parametrize("text", ["{", "[" * 50_000], ids=["cut off", "nested too deep"])
+def test_a_damaged_report_is_not_finished(tmp_path, text):
     job = job_of(tmp_path)
     run_job(job)
-    (tmp_path / "out.ply.adaptation.json").write_text("{")
+    (tmp_path / "out.ply.adaptation.json").write_text(text)
     assert finished(job) is None
 
 

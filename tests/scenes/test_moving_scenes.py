@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from moving_captures import dynerf, hypernerf, poses
 from PIL import Image
 
 from mipmap_plugin import wrap_model
@@ -19,28 +20,6 @@ from mipmap_plugin.commands.common import scene
 from mipmap_plugin.errors import SceneError, SettingsError
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.scenes import load_photographs, load_scene, read_cameras, write_cameras
-
-
-def poses(count=4):
-    """[count, 3, 4] camera to world with OpenGL axes, somewhere."""
-    views = tiny.cameras(count)
-    flip = np.diag([1.0, -1, -1, 1])
-    return np.stack([(np.linalg.inv(view.viewmat.numpy()) @ flip)[:3] for view in views])
-
-
-def dynerf(path, count=4, frames=0):
-    """poses_bounds.npy as LLFF writes it: axes down, right, backwards, the place, height, width and focal length; near and far."""
-    path.mkdir(parents=True)
-    p = poses(count)
-    size = np.broadcast_to(np.array([2028.0, 2704.0, 1460.0])[:, None], (count, 3, 1))
-    llff = np.concatenate([-p[..., 1:2], p[..., 0:1], p[..., 2:4], size], -1)
-    np.save(path / "poses_bounds.npy", np.concatenate([llff.reshape(count, 15), np.tile([1.0, 9.0], (count, 1))], 1))
-    for number in range(count):
-        (path / f"cam{number:02d}.mp4").touch()
-        for frame in range(frames):
-            (path / f"cam{number:02d}/images").mkdir(parents=True, exist_ok=True)
-            Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(path / f"cam{number:02d}/images/{frame:04d}.png")
-    return path
 
 
 def project_pose(pose):
@@ -100,22 +79,6 @@ def test_videos_of_deformable_without_frames_have_the_recorded_size(tmp_path):
     assert len(scene.split("train")) == 96 and not scene.images
     assert {(camera.width, camera.height) for camera in scene.cameras} == {(1600, 1200)} and scene.cameras[0].fx == pytest.approx(1460 * 1600 / 2704)
     assert {(camera.width, camera.height) for camera in load_photographs(path, cfg).cameras} == {(2704, 2028)}
-
-
-def hypernerf(path, count=9, val=True, rgb=True):
-    (path / "camera").mkdir(parents=True)
-    names = [f"{number:06d}" for number in range(count)]
-    for name, pose in zip(names, poses(count), strict=True):
-        turn = (pose[:, :3] @ np.diag([1.0, -1, -1])).T
-        lens = {"focal_length": 500.0, "principal_point": [250.0, 310.0], "image_size": [536, 960], "pixel_aspect_ratio": 1.0, "skew": 0.0}
-        (path / f"camera/{name}.json").write_text(json.dumps({"orientation": turn.tolist(), "position": pose[:, 3].tolist(), **lens}))
-        if rgb:
-            (path / "rgb/2x").mkdir(parents=True, exist_ok=True)
-            Image.fromarray(np.zeros((480, 268, 3), np.uint8)).save(path / f"rgb/2x/{name}.png")
-    splits = {"train_ids": names[::2], "val_ids": names[1::2]} if val else {"train_ids": [], "val_ids": []}
-    (path / "dataset.json").write_text(json.dumps({"count": count, "ids": names, **splits}))
-    (path / "metadata.json").write_text(json.dumps({name: {"warp_id": i, "appearance_id": i, "camera_id": 0} for i, name in enumerate(names)}))
-    return path
 
 
 @pytest.mark.parametrize("rgb", [True, False])
@@ -221,6 +184,21 @@ def test_broken_ones_are_refused_in_one_sentence(tmp_path):
     (path / "camera/000004.json").write_text('{"orientation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}')
     with pytest.raises(SceneError, match="orientation: is not a rotation"):
         load_scene(path)
+
+
+def test_a_camera_file_that_is_no_object_is_refused(tmp_path):
+    path = hypernerf(tmp_path / "h")
+    (path / "camera/000004.json").write_text("0.5")
+    with pytest.raises(SceneError, match=r"000004\.json: holds no values by name"):
+        load_scene(path)
+
+
+def test_an_array_whose_header_is_cut_off_is_refused(tmp_path):
+    path = dynerf(tmp_path / "d") / "poses_bounds.npy"
+    whole = path.read_bytes()
+    path.write_bytes(whole.replace(b"'shape': (4, 17)", b"'shape': (4, 17 "))
+    with pytest.raises(SceneError, match="is not an array"):
+        load_scene(path.parent)
 
 
 def test_a_moving_model_adapts_to_these_cameras_at_their_times(tmp_path):

@@ -10,6 +10,7 @@ from pathlib import Path
 import anchor_checkpoints
 import gltf_files
 import moving
+import moving_captures
 import numpy as np
 import ply_files
 import tiny
@@ -183,6 +184,10 @@ def _mip(path: Path) -> Path:
     return ply_files.write(path / "a.ply", columns)
 
 
+def _adapted(path: Path) -> Path:
+    return wrap_model(tiny.ply(path.with_name("base.ply")), cameras=tiny.cameras(2)).adapt(1 / 2, recipe="instant").save(path / "a.ply")
+
+
 def _anchors(layout: anchor_checkpoints.Layout) -> Callable[[Path], Path]:
     def make(path: Path) -> Path:
         anchor_checkpoints.write(path, layout, count=12)
@@ -242,6 +247,7 @@ SAMPLES: dict[str, Sample] = {
     "ply, big endian": Sample(_ply("binary_big_endian"), "a.ply", PLY),
     "ply, lists": Sample(_ply("binary_little_endian", lists=True), "a.ply", PLY),
     "ply, ascii lists": Sample(_ply("ascii", lists=True), "a.ply", PLY),
+    "ply, adapted": Sample(_adapted, "a.ply", PLY),
     "ply of Mip-Splatting": Sample(_mip, "a.ply", PLY),
     "ply of Scaffold-GS": Sample(_anchors(UNITED), SPLATS, PLY),
     "ply of Octree-GS": Sample(_anchors(anchor_checkpoints.Layout("octree", united=True)), SPLATS, PLY),
@@ -250,6 +256,9 @@ SAMPLES: dict[str, Sample] = {
     "cfg_args of Octree-GS": Sample(_anchors(anchor_checkpoints.Layout("octree", united=True)), "cfg_args", OPTIONS),
     "cameras.json": Sample(_folder, "cameras.json", ("of_json", *TEXT)),
     "exposure.json": Sample(_folder, "exposure.json", ("of_json", *TEXT)),
+    "poses_bounds.npy": Sample(moving_captures.dynerf, "poses_bounds.npy", BINARY, open=lambda path: load_scene(path) and None),
+    "dataset.json": Sample(moving_captures.hypernerf, "dataset.json", ("of_json", *TEXT), is_scene=True),
+    "a camera of HyperNeRF": Sample(moving_captures.hypernerf, "camera/000001.json", ("of_json", *TEXT), is_scene=True),
     "transforms.json": Sample(_transforms, "transforms.json", ("of_json", "of_json", *TEXT), is_scene=True),
     "deform.pth": Sample(_deformable, "deform/iteration_40000/deform.pth", TORCH),
     "deformation.pth": Sample(moving.write_hexplane, "point_cloud/iteration_14000/deformation.pth", TORCH),

@@ -174,6 +174,7 @@ def test_a_ladder_shows_the_level_of_the_zoom(tmp_path, base, screen):
 
 
 DAMAGED = ['{"levels": []}', "[]", '{"levels": [{"file": "level_0.ply"}]}', '{"levels": [{"file": "a", "shown_from": "b"}]}']
+DAMAGED += [f'{{"levels": [{{"file": "level_0.ply", "shown_from": {"9" * 400}}}]}}']  # more than a float holds
 BY_DISTANCE = '{"by": "distance", "levels": [{"file": "level_0.ply", "distance_from": 0}]}'  # whose picture has a level for each distance
 
 

@@ -8,8 +8,9 @@ from vanilla_models import raw_model, same
 from mipmap_plugin.errors import CheckpointError, OutputExists
 from mipmap_plugin.formats.cfg_args import read_cfg_args
 from mipmap_plugin.formats.ply import read_ply
-from mipmap_plugin.formats.tags import provenance_of, with_tags
+from mipmap_plugin.formats.tags import provenance_of, recorded_filter, with_tags
 from mipmap_plugin.models import load_model
+from mipmap_plugin.models.adapted_scale import adapted_scale
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.reading import load_vanilla
 
@@ -41,6 +42,15 @@ def test_header_keeps_foreign_comments_and_replaces_those_of_this_package(tmp_pa
     assert comments[:4] == ("Exported from Brush", "mip=true", "kernel_size=0.3", "SplatRenderMode: mip")
     assert len(comments) == 5 and comments[4].isascii()
     assert provenance_of(comments) == {**PROVENANCE, "name": "Brüder\n"}
+
+
+@pytest.mark.parametrize("digits", [400, 5000])  # more than a float holds, and than Python reads
+def test_records_with_absurd_numbers_count_as_none(tmp_path, digits):
+    huge = "9" * digits
+    record = f'mipmap_plugin {{"scale": {huge}, "screen_filter": "analytic", "kernel_size": {huge}}}'
+    file = write_splats(tmp_path / "a.ply", comments=(record,))
+    assert adapted_scale(file) is None and recorded_filter([record]) is None
+    assert load_vanilla(file).trained.screen_filter == "classic"
 
 
 def test_header_says_default_for_the_classic_filter(tmp_path):
