@@ -35,7 +35,6 @@ WHOLE, TIGHT = 0.995, 1.4
 # show this size, the others at NEARER of it, but none is within the MIDDLE of the splats. Adapted to views that frame all splats, from up to 15 times
 # as far away as the cameras, a bird and flowers look worse than their bases from where they were photographed.
 INNER, SHARP_PX, NEARER, MIDDLE = 1 / 2, 2.0, 1 / 2, 1 / 4
-FARTHER = 1.6  # of where the colors tell of (`where_photographed`): half of the views are farther, as it tells too near and too far by that
 SHARP_FOCAL = 400 / math.tan(ORBIT_FOV / 2)  # of pictures of 800 px
 SEEN_OPACITY = 0.1
 
@@ -56,8 +55,8 @@ class Orbit:
     """What an orbit goes around, in world units: `center`, the vertical `up` (None: not known), and how far away its cameras are.
 
     `nearest`: how far half of them are, if that is not the same (0).
-    `seen`: in which directions a capture was photographed, as its colors tell (`photographed`), and `focal`: the focal length (px) of pictures
-    from `nearest`. Without them ("", 0) all directions count, and pictures have the size that is asked for.
+    `seen`: in which directions a capture was photographed, as its colors tell (`photographed`), and `focal`: with which focal length, px. Without
+    them ("", 0) all directions count, and pictures have the size that is asked for.
     `said`: the user or the base's files say what is up; otherwise it is guessed from the splats (`guess_up`).
     """
 
@@ -96,7 +95,7 @@ class Orbit:
         found = photographed(splats, center, outside, max(outside, framing), ORBIT_FOV / 2)
         if found is None:
             return self
-        return replace(self, distance=FARTHER * found.distance, nearest=found.distance, seen=found.seen, focal=found.focal)
+        return replace(self, distance=found.farthest, nearest=found.nearest, seen=found.seen, focal=found.focal)
 
     def told(self) -> str:
         """From where its views look, in words; "" from all around."""
@@ -120,9 +119,8 @@ class Orbit:
         # Two far, two near: if all views of one part of the turn were near, these would be on one side only, and if every other view were, all of
         # them would be in the same half of the validation views.
         far = [self.distance if i // 2 % 2 == 0 else self.nearest or self.distance for i in range(count)]
-        focals = [self.focal * each / self.nearest if self.focal else None for each in far]  # of pictures that show the middle in the same detail
         return [
-            _looking_at(center, center + far[i] * way, vertical, size, f"orbit_{first + i:04d}", focals[i]) for i, way in enumerate(directions)
+            _looking_at(center, center + far[i] * way, vertical, size, f"orbit_{first + i:04d}", self.focal) for i, way in enumerate(directions)
         ]
 
     def _ways(self, vertical: Tensor, count: int, generator: torch.Generator) -> Tensor:
@@ -208,17 +206,17 @@ def _directions(up: Tensor, turns: Tensor, height: Tensor) -> Tensor:
     return (1 - height**2).sqrt() * (azimuth.cos() * east + azimuth.sin() * north) + height * up
 
 
-def _looking_at(target: Tensor, eye: Tensor, up: Tensor, size: tuple[int, int], name: str, focal: float | None = None) -> Camera:
+def _looking_at(target: Tensor, eye: Tensor, up: Tensor, size: tuple[int, int], name: str, focal: float = 0.0) -> Camera:
     """A camera at `eye` that looks at `target`, with `up` upwards. The columns of its rotation are right, down and forward.
 
-    `focal`, px: by default that with which a picture of this `size` shows `ORBIT_FOV`. A picture that would show more is smaller.
+    `focal`, px: 0 for that with which a picture of this `size` shows `ORBIT_FOV`. A picture that would show more is smaller.
     """
     forward = (target - eye) / (target - eye).norm()
     right = torch.linalg.cross(forward, up)
     right = right / right.norm()
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1)
     usual = min(size) / (2 * math.tan(ORBIT_FOV / 2))
-    focal = usual if focal is None else focal
+    focal = focal or usual
     height, width = (max(1, round(side * min(1.0, focal / usual))) for side in size)
     return Camera(width, height, focal, focal, width / 2, height / 2, viewmat_of(rotation, eye), name)
 

@@ -9,8 +9,8 @@ import torch
 
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.adapted_scale import orbit_in
-from mipmap_plugin.scenes.orbits import FARTHER, ORBIT_FOV, Orbit
-from mipmap_plugin.scenes.photographed import CONTRAST, LEAST, SMALLEST, agreement, even_directions, photographed, seen_ways
+from mipmap_plugin.scenes.orbits import ORBIT_FOV, Orbit
+from mipmap_plugin.scenes.photographed import CONTRAST, FARTHER, LEAST, SMALLEST, agreement, even_directions, photographed, seen_ways
 from mipmap_plugin.splatting.harmonics import basis
 
 COUNT, FAR = 1500, 6.0
@@ -64,7 +64,7 @@ def test_the_agreement_of_colors_by_chance_is_the_same_everywhere():
 
 
 def test_the_distance_of_the_cameras_is_found():
-    assert FAR / FARTHER < found(capture()).distance < FAR * FARTHER
+    assert FAR / FARTHER < found(capture()).nearest < FAR * FARTHER
 
 
 def test_the_directions_of_the_cameras_count_as_seen_and_those_across_do_not():
@@ -78,8 +78,9 @@ def test_the_directions_of_the_cameras_count_as_seen_and_those_across_do_not():
 def test_the_smallest_splats_are_pixels_in_pictures_from_there():
     splats = capture()
     told = found(splats)
-    eyes = told.distance * seen_ways(told.seen, 200, draws(5))
-    depth = torch.stack([(splats.means - eye) @ -eye / told.distance for eye in eyes])
+    ways = seen_ways(told.seen, 200, draws(5))
+    eyes = torch.cat([told.nearest * ways[::2], told.farthest * ways[1::2]])
+    depth = torch.stack([(splats.means - eye) @ -eye / eye.norm() for eye in eyes])
     angle = depth / torch.stack([(splats.means - eye).norm(dim=1) for eye in eyes])
     closest = torch.where(angle > math.cos(ORBIT_FOV / 2), depth, math.inf).amin(0)
     pixels = splats.scales[:, 0] * told.focal / closest
@@ -105,17 +106,16 @@ def test_splats_that_are_not_finite_are_not_asked():
     splats = capture()
     broken = replace(splats, sh=splats.sh.clone(), means=splats.means.clone())
     broken.sh[::7], broken.means[::11] = math.nan, math.inf
-    assert found(broken).distance == pytest.approx(found(splats).distance, rel=0.3)
+    assert found(broken).nearest == pytest.approx(found(splats).nearest, rel=0.3)
 
 
-def test_views_are_where_the_colors_tell_half_of_them_farther_and_with_the_same_detail():
+def test_views_are_where_the_colors_tell_half_of_them_farther_and_as_wide_as_usual():
     orbit = Orbit.around(table(), sharp=lambda: 0.01).where_photographed(capture())
     views = orbit.views((10_000, 10_000), 40, draws(6))
     center = torch.tensor(orbit.center, dtype=torch.float64)
     far = torch.stack([view.center.double() - center for view in views]).norm(dim=1)
     assert sorted({round(each, 6) for each in far.tolist()}) == [round(orbit.nearest, 6), round(FARTHER * orbit.nearest, 6)]
-    detail = [view.fx / float(each) for view, each in zip(views, far, strict=True)]
-    assert detail == pytest.approx([orbit.focal / orbit.nearest] * 40)
+    assert [view.fx for view in views] == [orbit.focal] * 40
     assert [view.width for view in views] == pytest.approx([2 * view.fx * math.tan(ORBIT_FOV / 2) for view in views], abs=1)
 
 
