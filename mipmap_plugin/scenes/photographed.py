@@ -36,7 +36,7 @@ CONTRAST = 0.1
 DISTANCES, TRIED = 24, 64
 
 # The colors tell of a distance 1.15 times that of the cameras in one capture, and 0.66 times in another: half of the views are so many times as far.
-FARTHER = 1.6
+FARTHER = 1.4
 
 # This part of the splats that pictures show is smaller than a pixel: in the closest photographs of two captures a tenth are below 1.01 and 1.09 px.
 SMALLEST = 0.1
