@@ -47,10 +47,8 @@ INTRO = """# Scenes of real size
 
 Made by `python benchmarks/size.py DATA`, in pieces: seconds, CPU seconds and the peak of memory (over what Python, torch and the package
 themselves take, as a multiple of the PLY's size) of whole commands and of their phases, `adapt` at x1/4, on flowers with its splats split into so
-many, 173 cameras of 1256 x 828 px. *Silence*: the longest time without a sign on the terminal, and in brackets until the first. *by rows*: runs
-of 1b73abd on two free cores, with as many steps as its `default` takes: 475 at 300,000 splats, 150 at 1 and 3 million. In the other rows five others
-used the two cores, so that seconds and silences are several times those of a quiet machine: compare CPU seconds. *before*: 6867b30.
-`evaluate`: the base and everything that needs no adapting, on {photographs} photographs. {machine}
+many, 173 cameras of 1256 x 828 px. *Silence*: the longest time without a sign on the terminal, and in brackets until the first. Two cores, which
+nobody else used. `evaluate`: the base and everything that needs no adapting, on {photographs} photographs. {machine}
 """
 HEAD = "| splats | command | version | phase | seconds | CPU s | peak / file | silence |\n|" + "---|" * 8
 
