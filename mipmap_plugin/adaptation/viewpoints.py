@@ -121,7 +121,7 @@ def orbit_of(
     """What an orbit around a model goes around. That of an adapted file is its base's, so that both are seen from the same places.
 
     `up`: the vertical, as the user or the base's files say (`wrap.Wrapped.trained`); None: they do not. `means` [N, 3]: of all splats,
-    where the model has but some of its file. `lone`: it came without cameras, so that a capture's colors are asked where it was photographed.
+    where the model has but some of its file. `lone`: it came without cameras, so that its colors are asked where it was photographed.
     """
     recorded = adapted_orbit(model.source)
     if recorded is None:
@@ -130,7 +130,7 @@ def orbit_of(
             return sharp_size(model.gaussians(ONE_PIXEL)) if model.traits.same_for_all_views else math.inf
 
         orbit = Orbit.around(everywhere(model) if means is None else means, sharp=size)
-        if lone and orbit.nearest and model.traits.same_for_all_views:
+        if lone and model.traits.same_for_all_views:
             orbit = orbit.where_photographed(model.gaussians(ONE_PIXEL))
     else:
         orbit = Orbit(**recorded)

@@ -21,10 +21,10 @@ def draws(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def cameras() -> torch.Tensor:
+def cameras(far: float = FAR) -> torch.Tensor:
     """Places [C, 3] on the half of a ring around the scene, a little above it."""
     turn = torch.linspace(0, math.pi, 24, dtype=torch.float64)
-    return FAR * torch.nn.functional.normalize(torch.stack([turn.cos(), torch.full_like(turn, -0.2), turn.sin()], 1), dim=1)
+    return far * torch.nn.functional.normalize(torch.stack([turn.cos(), torch.full_like(turn, -0.2), turn.sin()], 1), dim=1)
 
 
 def table() -> torch.Tensor:
@@ -34,11 +34,11 @@ def table() -> torch.Tensor:
     return means
 
 
-def capture() -> Gaussians:
+def capture(far: float = FAR) -> Gaussians:
     """Splats whose colors are noise that was fitted toward the cameras: what steps of gradient descent from 0 can make of their bands."""
     means = table()
-    rays = torch.nn.functional.normalize(means - cameras()[:, None], dim=2)
-    noise = torch.randn(len(cameras()), COUNT, 3, generator=draws(1), dtype=torch.float64)
+    rays = torch.nn.functional.normalize(means - cameras(far)[:, None], dim=2)
+    noise = torch.randn(len(rays), COUNT, 3, generator=draws(1), dtype=torch.float64)
     sh = torch.einsum("vnk,vnc->nkc", basis(rays.flatten(0, 1), 3).unflatten(0, rays.shape[:2]), noise) / 100
     sizes = 0.01 + 0.09 * torch.rand(COUNT, 1, generator=draws(2), dtype=torch.float64)
     turned = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(COUNT, 4)
@@ -102,6 +102,14 @@ def test_colors_that_do_not_tell_change_nothing(silent):
     assert orbit.where_photographed(silent(capture())) is orbit
 
 
+@pytest.mark.parametrize(("far", "from_within"), [(6.0, False), (2.2, True)], ids=["object", "capture"])
+def test_what_is_compact_is_an_object_unless_it_was_photographed_from_within(far, from_within):
+    compact = capture(far)[COUNT // 10 :]
+    framed = Orbit.around(compact.means)
+    assert framed.nearest == 0
+    assert bool(framed.where_photographed(compact).nearest) == from_within
+
+
 def test_splats_that_are_not_finite_are_not_asked():
     splats = capture()
     broken = replace(splats, sh=splats.sh.clone(), means=splats.means.clone())
@@ -109,13 +117,13 @@ def test_splats_that_are_not_finite_are_not_asked():
     assert found(broken).nearest == pytest.approx(found(splats).nearest, rel=0.3)
 
 
-def test_views_are_where_the_colors_tell_half_of_them_farther_and_as_wide_as_usual():
+def test_views_are_where_the_colors_tell_half_of_them_farther_and_in_the_same_detail():
     orbit = Orbit.around(table(), sharp=lambda: 0.01).where_photographed(capture())
     views = orbit.views((10_000, 10_000), 40, draws(6))
     center = torch.tensor(orbit.center, dtype=torch.float64)
     far = torch.stack([view.center.double() - center for view in views]).norm(dim=1)
     assert sorted({round(each, 6) for each in far.tolist()}) == [round(orbit.nearest, 6), round(FARTHER * orbit.nearest, 6)]
-    assert [view.fx for view in views] == [orbit.focal] * 40
+    assert [view.fx / float(each) for view, each in zip(views, far, strict=True)] == pytest.approx([orbit.focal / orbit.nearest] * 40)
     assert [view.width for view in views] == pytest.approx([2 * view.fx * math.tan(ORBIT_FOV / 2) for view in views], abs=1)
 
 
