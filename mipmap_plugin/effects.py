@@ -113,7 +113,8 @@ def explain(
     if effects.exposure:
         by_name["exposure"] = replace(by_name["exposure"], on=True, reason="requested; exposure.json has an entry for this view")
     model_effects = [by_name[effect.name] for effect in MODEL_EFFECTS]
-    return (*model_effects, *_rendering_effects(effects, gaussians), *_adaptation_effects(config, scale))
+    base_degree = effects.sh_degree if config is None else gaussians.used_sh_degree()  # which takes a look at all, too long for a render
+    return (*model_effects, *_rendering_effects(effects, gaussians, base_degree), *_adaptation_effects(config, scale))
 
 
 def enlarges(config: AdaptConfig, scale: float) -> bool:
@@ -121,12 +122,12 @@ def enlarges(config: AdaptConfig, scale: float) -> bool:
     return scale > 1 and config.compare_at == "target"
 
 
-def _rendering_effects(effects: Effects, gaussians: Gaussians) -> list[Effect]:
+def _rendering_effects(effects: Effects, gaussians: Gaussians, base_degree: int) -> list[Effect]:
     integrates, n, has_covariances = effects.screen_filter in INTEGRATED, effects.supersampling, gaussians.covariances is not None
     size = "over the area of a pixel" if integrates else f"{effects.eps2d:g} px²"
     filter_cost = "five more exponentials per splat and pixel" if integrates else "two sums and a determinant per splat"
     return [
-        _view_dependent_color(effects.sh_degree, gaussians),
+        _view_dependent_color(effects.sh_degree, gaussians, base_degree),
         Effect("screen filter", effects.eps2d > 0 or integrates, f"{effects.screen_filter}, {size}", filter_cost),
         Effect("compensation", *_compensation(effects), "a square root per splat"),
         Effect("supersampling", n > 1, f"{n * n} sample{'s' if n > 1 else ''} per pixel", f"{n * n if n > 1 else 'N x N'} times the pixels"),
@@ -181,11 +182,11 @@ def _viewer_effects(settings: RenderSettings) -> list[Effect]:
     return [Effect(name, on, reason_on if on else reason_off, cost) for name, on, reason_on, reason_off, cost in parts]
 
 
-def _view_dependent_color(degree: int, gaussians: Gaussians) -> Effect:
-    held, used, bands = gaussians.sh_degree, gaussians.used_sh_degree(), (degree + 1) ** 2
+def _view_dependent_color(degree: int, gaussians: Gaussians, base_degree: int) -> Effect:
+    held, bands = gaussians.sh_degree, (degree + 1) ** 2
     available = max(bands, gaussians.sh.shape[1])
-    more = f"SH up to degree {degree}, of the base up to {used}: merging has made room for more"
-    reason = more if degree > used else f"SH up to degree {degree} of {held}: above it every coefficient is 0"
+    more = f"SH up to degree {degree}, of the base up to {base_degree}: merging has made room for more"
+    reason = more if degree > base_degree else f"SH up to degree {degree} of {held}: above it every coefficient is 0"
     count = bands if degree > 0 else available - 1
     return Effect("view-dependent color", degree > 0, reason, f"a direction and {count} of {available} coefficients per splat")
 

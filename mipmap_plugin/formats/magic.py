@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import re
 import zipfile
 import zlib
@@ -64,7 +63,7 @@ def kind_of(path: Path) -> str:
     if re.match(rb"ply\s", head):
         return "ply"
     if head.startswith(b"\x1f\x8b"):
-        return "spz" if _inflated(path) == b"NGSP" else "gzip"
+        return "spz" if _inflated(head) == b"NGSP" else "gzip"
     for magic, kind in {b"NGSP": "spz", b"glTF": "glb", b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19": "torch"}.items():
         if head.startswith(magic):
             return kind
@@ -96,12 +95,10 @@ def texts_in(pickle: bytes, begins: str) -> tuple[str, ...]:
     return tuple(pickle[at : at + int.from_bytes(pickle[at - 4 : at], "little")].decode(errors="replace") for at in places)
 
 
-def _inflated(path: Path) -> bytes:
-    """What a gzip file begins with once unpacked, however long the file's name is in its header; empty if it is damaged."""
+def _inflated(head: bytes) -> bytes:
     try:
-        with gzip.open(path) as file:
-            return file.read(4)
-    except (OSError, EOFError, zlib.error):
+        return zlib.decompressobj(wbits=31).decompress(head, 4)
+    except zlib.error:
         return b""
 
 

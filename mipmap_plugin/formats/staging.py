@@ -159,7 +159,7 @@ def exchange(one: Path, other: Path) -> bool:
 def _flush(path: Path) -> None:
     """Write a file, or the names in a folder, to the disk now: else a power cut may leave the new name without the bytes. Raises OSError."""
     try:
-        # Windows flushes no file that is open for reading only, so that a read-only one is left as it is there, as are folders, and links anywhere.
+        # Windows flushes only what is open for writing, so that folders and read-only files are left out there; links are left out everywhere.
         opened = os.open(path, (os.O_RDWR if os.name == "nt" else os.O_RDONLY) | getattr(os, "O_NOFOLLOW", 0))
     except OSError:
         return
@@ -286,6 +286,7 @@ def _finish(folder: Path, lock: int) -> None:
     try:
         if (folder / "ready").is_dir():
             _move_in(folder)
+            _flush(folder.parent)
         _remove_spent(folder)
     except BaseException:
         os.close(lock)  # so that whoever writes or loads next finishes the moves, this process too, before something newer is there

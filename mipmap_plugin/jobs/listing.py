@@ -59,7 +59,8 @@ def without_outputs(checkpoints: Iterable[Path]) -> tuple[list[Path], list[Path]
     kept: list[Path] = []
     left_out: list[Path] = []
     for path in checkpoints:
-        (left_out if _is_output(path) or _is_output(Path(realpath(path))) else kept).append(path)  # a link has no report beside it
+        linked = path.is_symlink() and _is_output(Path(realpath(path)))  # a link has no report beside it
+        (left_out if linked or _is_output(path) else kept).append(path)
     return kept, left_out
 
 

@@ -24,7 +24,10 @@ REMEDIES = {"nerfstudio": RUN, "gsplat": RUN, "OpenSplat": "give the cameras.jso
 
 
 def adapted_scale(source: Path | None) -> float | None:
-    """The scale that the file `source` was adapted to; None if none that can be, as of a base. Raises CheckpointError, SceneError (`_record`)."""
+    """The scale that the file `source` was adapted to; None of a base, and where an impossible one is recorded.
+
+    Raises CheckpointError, SceneError (`_record`).
+    """
     scale = _record(source).get("scale")
     return float(scale) if isinstance(scale, (int, float)) and MIN_SCALE <= scale <= MAX_SCALE else None
 

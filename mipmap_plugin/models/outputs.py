@@ -116,8 +116,8 @@ def without_place(path: Path, extras: Iterable[str], sh_degree: int) -> str:
 def cut_off(path: Path, parameters: Mapping[str, Tensor]) -> str:
     """How many of the splats with these raw `parameters` an SPZ at `path` cannot hold, even rounded, in a sentence; "" for any other format.
 
-    Of thin splats only the longest axis counts: the others are lengthened by less than anybody sees. So are splats that are shorter than SPZ has room
-    for, as a zoom-out makes many, in a scene of some size.
+    Of thin splats only the longest axis counts: the others are lengthened by less than anybody sees. Nor do short splats count, of which a zoom-out
+    makes many, unless the scene is so small that their lengthening is seen.
     """
     if not is_spz(path) or not {"means", "scales", "sh0", "shN"} <= parameters.keys():
         return ""

@@ -35,7 +35,7 @@ class Judgment:
     validation: dict[str, float]  # dB
     returned: str  # the name of the best, or of the last where the settings say so
     notes: list[str]  # what there is to say of splats and views, in sentences
-    as_trained: float | None = None  # dB of the base as its training drew it; None where the target draws so too
+    as_trained: float | None = None  # dB of the base as its training drew it; None at x1, and where the target draws so too
 
 
 def judged(scene: TiledScene) -> Judgment:
@@ -50,7 +50,7 @@ def judged(scene: TiledScene) -> Judgment:
     found = {name: Quality.of([each]) for name, each in errors.items()}
     validation = {name: each.psnr for name, each in found.items()}
     as_trained = None
-    if scene.base_effects != scene.target:
+    if scene.scale != 1 and scene.base_effects != scene.target:
         as_trained = Quality.of([errors_of(scene, scene.base, truths, views, scene.base_effects)]).psnr
     best, worse = JOINED, list[str]()
     if scene.config.returns == "best":

@@ -192,6 +192,14 @@ def test_images_and_reports_list_effects():
     assert Report(**json.loads(json.dumps(report.model_dump()))) == report
 
 
+def test_a_render_does_not_look_for_the_bands_in_use_again(monkeypatch):
+    """Of a million splats that takes as long as drawing a small picture."""
+    model = wrapped(with_bands(0, 3))
+    model.render(tiny.cameras(1)[0])
+    monkeypatch.setattr(Gaussians, "used_sh_degree", None)
+    assert model.render(tiny.cameras(1)[0]).effects
+
+
 def test_inspect_prints_effects(tmp_path, capsys):
     assert cli.main(["inspect", str(tiny.folder(tmp_path / "plain")), "--all", "--no-viewers"]) == 0
     out = capsys.readouterr().out

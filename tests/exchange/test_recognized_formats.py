@@ -245,13 +245,6 @@ def test_a_splat_transform_that_does_not_start_is_no_fault_of_the_file(tmp_path,
     )
 
 
-def test_an_spz_with_a_long_name_in_its_gzip_header_is_one(tmp_path, tool):
-    """Longer than what is read of other files."""
-    packed = gzip.compress(SPZ)
-    (tmp_path / "a.spz").write_bytes(packed[:3] + b"\x08" + packed[4:10] + b"n" * 70_000 + b"\0" + packed[10:])
-    assert detect(tmp_path / "a.spz").family == "exchange"
-
-
 def test_an_error_of_node_is_told(tmp_path, tool):
     answer_by(tool, "print('failed in 0.006s')\nsys.exit('TypeError [ERR_PARSE_ARGS_UNKNOWN_OPTION]: Unknown option')")
     with pytest.raises(OutputError, match=r"does not write it \(Unknown option\)"):

@@ -81,6 +81,19 @@ def test_moves_that_fail_are_finished_before_the_same_process_writes_anew(tmp_pa
     assert text_of(settled(out)) == "newest" and {path.name for path in out.parent.iterdir()} == {"out", "out.json"}
 
 
+def test_the_moves_of_a_killed_run_are_on_the_disk_before_what_is_spent_goes(tmp_path, monkeypatch):
+    begin(tmp_path / "place", 2, replaced=False)
+    out, flushed, before = tmp_path / "place" / "out", [], []
+    with monkeypatch.context() as dead:
+        for name in ("_move_in", "_remove"):
+            dead.setattr(staging, name, lambda *_: None)
+        dead.setattr(staging.Staging, "close", lambda self: os.close(self._lock))
+        write(out, "new", 2)
+    monkeypatch.setattr(staging, "_flush", flushed.append)
+    monkeypatch.setattr(staging, "_remove", lambda path, _: before.append((path.name, *flushed)))
+    assert text_of(settled(out)) == "new" and sorted(before) == [("out.resume", out.parent), ("out.tiles", out.parent)]
+
+
 def test_what_another_run_has_put_there_since_is_not_taken_for_spent(tmp_path, monkeypatch):
     begin(tmp_path / "place", 1, replaced=False)
     out, state = tmp_path / "place" / "out", tmp_path / "place" / "out.resume"

@@ -82,6 +82,8 @@ def test_a_viewer_that_suits_a_scene_less_than_its_own_renderer_does_is_told_of_
     whole = wrap_model(shown.base.checkpoint).adapt(0.9, viewer="antimatter15", **settings).report
     assert report.as_trained == pytest.approx(whole.as_trained, abs=0.01) and report.as_trained > report.psnr_after()
     assert [note for note in report.notes if "the base itself has" in note] and [note for note in whole.notes if "the base itself has" in note]
+    shown = replace(shown, target=tmp_path / "at_1.ply", scale=1.0)  # where the base so drawn is the truth
+    assert adapt_in_tiles(replace(shown, settings=settings), 2).report.as_trained is None
 
 
 def test_a_viewer_that_rounds_the_positions_of_a_scene_far_out_is_told_of_in_tiles_too(job, tmp_path):
