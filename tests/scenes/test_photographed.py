@@ -10,7 +10,7 @@ import torch
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.adapted_scale import orbit_in
 from mipmap_plugin.scenes.orbits import ORBIT_FOV, Orbit
-from mipmap_plugin.scenes.photographed import CONTRAST, FARTHER, LEAST, SMALLEST, agreement, even_directions, photographed, seen_ways
+from mipmap_plugin.scenes.photographed import CONTRAST, FARTHER, LEAST, LONGEST, SMALLEST, agreement, even_directions, photographed, seen_ways
 from mipmap_plugin.splatting.harmonics import basis
 
 COUNT, FAR = 1500, 6.0
@@ -87,6 +87,14 @@ def test_the_smallest_splats_are_pixels_in_pictures_from_there():
     assert (pixels[closest.isfinite()] < 1).double().mean() == pytest.approx(SMALLEST, abs=0.05)
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-9])
+def test_specks_that_no_picture_shows_ask_for_no_longer_lens_than_there_are(size):
+    splats = capture()
+    specks = replace(splats, scales=splats.scales.clone())
+    specks.scales[::4] = size
+    assert found(specks) == replace(found(splats), focal=LONGEST)
+
+
 @pytest.mark.parametrize(
     "silent",
     [
@@ -129,5 +137,5 @@ def test_an_adapted_file_remembers_it():
     orbit = Orbit.around(table(), sharp=lambda: 0.01).where_photographed(capture())
     record = json.loads(json.dumps({"orbit": asdict(orbit)}))
     assert Orbit(**orbit_in(record)) == orbit
-    for wrong in ({"seen": "xyz"}, {"seen": "0"}, {"seen": "f" * 65}, {"focal": -1.0}):
+    for wrong in ({"seen": "xyz"}, {"seen": "0"}, {"seen": "f" * 65}, {"focal": -1.0}, {"focal": math.inf}):
         assert Orbit(**orbit_in({"orbit": record["orbit"] | wrong})) == replace(orbit, seen="", focal=0.0)
