@@ -133,6 +133,13 @@ def test_pictures_are_no_larger_than_asked_and_keep_their_detail():
     assert (small.height, small.width, small.fx) == (10, 20, pytest.approx(large.fx))
 
 
+def test_pictures_that_show_less_show_all_parts_of_what_a_photograph_would():
+    orbit = replace(Orbit.around(table(), sharp=lambda: 0.01).where_photographed(capture()), focal=1000.0)
+    views, side = orbit.views((100, 100), 200, draws(8)), 2 * 1000 * math.tan(ORBIT_FOV / 2)
+    for middles in ([50 - view.cx for view in views], [50 - view.cy for view in views]):
+        assert (min(middles), max(middles)) == pytest.approx((50 - side / 2, side / 2 - 50), abs=side / 20)
+
+
 def test_an_adapted_file_remembers_it():
     orbit = Orbit.around(table(), sharp=lambda: 0.01).where_photographed(capture())
     record = json.loads(json.dumps({"orbit": asdict(orbit)}))
