@@ -98,13 +98,13 @@ class Orbit:
         return replace(self, distance=found.farthest, nearest=found.nearest, seen=found.seen, focal=found.focal)
 
     def told(self) -> str:
-        """From where its views look, in words; "" from all around."""
-        if self.seen:
-            return "from where its colors tell that it was photographed"
-        if self.up is None:
-            return "from all around"
+        """From where its views look, in words."""
+        around = "from above the horizon" if self.up else "from all around"
+        where = "from where its colors tell that it was photographed" if self.seen else around
+        if self.up is None or (self.seen and not self.said):
+            return where
         name = next((name for name, axis in AXES.items() if axis == self.up), f"({', '.join(f'{part:.3g}' for part in self.up)})")
-        return f"from above the horizon, with {name} up"
+        return f"{where}, with {name} up"
 
     def views(self, size: tuple[int, int], count: int, generator: torch.Generator, first: int = 0) -> list[Camera]:
         """`count` views of `size` (height, width) px: from above the horizon, or from all around where no vertical is known (the highest first).

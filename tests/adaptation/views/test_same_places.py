@@ -159,6 +159,11 @@ def test_what_is_up_is_not_asked_for_where_colors_tell_from_where_to_look():
     assert "--up" in orbited(None, lying) and "--up" not in orbited(None, replace(lying, seen="f", focal=500.0))
 
 
+def test_what_somebody_says_is_up_is_told_with_where_a_capture_was_photographed():
+    seen = Orbit((0.0, 0.0, 0.0), Z, 2.0, nearest=1.0, seen="f", focal=500.0)
+    assert ", with z up" in replace(seen, said=True).told() and "up" not in seen.told()
+
+
 @pytest.mark.parametrize(("floaters", "seems"), [(0, False), (1, True)], ids=["an object by itself", "splats far around it"])
 def test_without_cameras_a_capture_is_told_from_an_object(tmp_path, recwarn, floaters, seems):
     model = tiny.model(40)
