@@ -213,7 +213,7 @@ def orbited(source: Path | None, orbit: Orbit) -> str:
     """What is said of views of an orbit: `ORBITED`, with the cameras.json that lies beside the file of the splats."""
     file, whole = unread_cameras(source), not orbit.nearest
     beside = f", such as {file}, if it is of this scene" if file else ""
-    others = ("" if whole else VIEWED) + ("" if orbit.up else ", or say what is up (--up z, for one)")
+    others = ("" if whole else VIEWED) + ("" if orbit.up or orbit.seen else ", or say what is up (--up z, for one)")
     return f"{ORBITED.format(told=orbit.told(), seems='' if whole else CAPTURE)}{beside}{others}"
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 
 import torch
 from torch import Tensor
@@ -115,9 +116,7 @@ class ClearViews:
         return bool(all_of_it > 0 and fog <= all_of_it / 2)
 
 
-def orbit_of(
-    model: SplatModel, up: tuple[float, float, float] | None, means: Tensor | None = None, *, lone: bool = False
-) -> Orbit:
+def orbit_of(model: SplatModel, up: tuple[float, float, float] | None, means: Tensor | None = None, *, lone: bool = False) -> Orbit:
     """What an orbit around a model goes around. That of an adapted file is its base's, so that both are seen from the same places.
 
     `up`: the vertical, as the user or the base's files say (`wrap.Wrapped.trained`); None: they do not. `means` [N, 3]: of all splats,
@@ -125,13 +124,10 @@ def orbit_of(
     """
     recorded = adapted_orbit(model.source)
     if recorded is None:
-
-        def size() -> float:
-            return sharp_size(model.gaussians(ONE_PIXEL)) if model.traits.same_for_all_views else math.inf
-
-        orbit = Orbit.around(everywhere(model) if means is None else means, sharp=size)
-        if lone and model.traits.same_for_all_views:
-            orbit = orbit.where_photographed(model.gaussians(ONE_PIXEL))
+        same, splats = model.traits.same_for_all_views, cache(partial(model.gaussians, ONE_PIXEL))
+        orbit = Orbit.around(everywhere(model) if means is None else means, sharp=lambda: sharp_size(splats()) if same else math.inf)
+        if lone and same:
+            orbit = orbit.where_photographed(splats())
     else:
         orbit = Orbit(**recorded)
     return orbit if up is None else replace(orbit, up=up, said=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -58,7 +59,7 @@ def orbit_in(record: dict[str, Any]) -> dict[str, Any] | None:
 
 def _photographed(seen: Any, focal: Any) -> dict[str, Any]:
     """From where a capture was photographed, of a record that tells it in full."""
-    told = isinstance(seen, str) and re.fullmatch("[0-9a-f]{1,64}", seen) and int(seen, 16) and isinstance(focal, float) and focal > 0
+    told = isinstance(seen, str) and re.fullmatch("[0-9a-f]{1,64}", seen) and int(seen, 16) and isinstance(focal, float) and 0 < focal < math.inf
     return {"seen": seen, "focal": focal} if told else {}
 
 

@@ -102,13 +102,13 @@ class Orbit:
         return replace(self, distance=found.farthest, nearest=found.nearest, seen=found.seen, focal=found.focal)
 
     def told(self) -> str:
-        """From where its views look, in words; "" from all around."""
-        if self.seen:
-            return "from where its colors tell that it was photographed"
-        if self.up is None:
-            return "from all around"
+        """From where its views look, in words."""
+        around = "from above the horizon" if self.up else "from all around"
+        where = "from where its colors tell that it was photographed" if self.seen else around
+        if self.up is None or (self.seen and not self.said):
+            return where
         name = next((name for name, axis in AXES.items() if axis == self.up), f"({', '.join(f'{part:.3g}' for part in self.up)})")
-        return f"from above the horizon, with {name} up"
+        return f"{where}, with {name} up"
 
     def views(self, size: tuple[int, int], count: int, generator: torch.Generator, first: int = 0) -> list[Camera]:
         """`count` views of `size` (height, width) px: from above the horizon, or from all around where no vertical is known (the highest first).
@@ -124,9 +124,10 @@ class Orbit:
         # them would be in the same half of the validation views.
         far = [self.distance if i // 2 % 2 == 0 else self.nearest or self.distance for i in range(count)]
         focals = [self.focal * each / (self.nearest or each) for each in far]  # with which all show the middle in the same detail
-        return [
+        views = [
             _looking_at(center, center + far[i] * way, vertical, size, f"orbit_{first + i:04d}", focals[i]) for i, way in enumerate(directions)
         ]
+        return [_part(view, generator) for view in views]
 
     def _ways(self, vertical: Tensor, count: int, generator: torch.Generator) -> Tensor:
         """The directions of `count` cameras, unit vectors [count, 3], with `vertical` (unit) upwards."""
@@ -224,6 +225,20 @@ def _looking_at(target: Tensor, eye: Tensor, up: Tensor, size: tuple[int, int], 
     focal = focal or usual
     height, width = (max(1, round(side * min(1.0, focal / usual))) for side in size)
     return Camera(width, height, focal, focal, width / 2, height / 2, viewmat_of(rotation, eye), name)
+
+
+def _part(view: Camera, generator: torch.Generator) -> Camera:
+    """A view that shows less than `ORBIT_FOV`, moved to anywhere in one that shows so much; any other as it is.
+
+    If all views showed the middle, at x1/4 the flowers would look up to 2.9 dB worse than their base from where they were photographed, with a
+    quarter of `ORBIT_FOV`; so they look better, by 0.3 dB and more.
+    """
+    whole = 2 * math.tan(ORBIT_FOV / 2) * view.fx / min(view.size)
+    width, height = (int(side * (whole - 1)) for side in (view.width, view.height))
+    if max(width, height) <= 0:
+        return view
+    right, down = (torch.rand(2, generator=generator, dtype=torch.float64) - 0.5).tolist()
+    return replace(view, cx=view.cx + right * width, cy=view.cy + down * height)
 
 
 def _finite(means: Tensor) -> Tensor:

@@ -41,6 +41,9 @@ FARTHER = 1.4
 # This part of the splats that pictures show is smaller than a pixel: in the closest photographs of two captures a tenth are below 1.01 and 1.09 px.
 SMALLEST = 0.1
 
+# px: the longest focal length, that of a photograph of 24 megapixels. Of splats that nothing could show, tiny or flat, there may be many.
+LONGEST = 5000.0
+
 
 @dataclass(frozen=True)
 class Photographed:
@@ -132,7 +135,7 @@ def _focal(splats: Gaussians, center: Tensor, eyes: Tensor, half_fov: float) -> 
         return 0.0
     sizes = splats.scales.topk(2, dim=1).values.prod(dim=1).sqrt()[shown] / closest[shown]
     smallest = sizes.kthvalue(max(1, round(SMALLEST * len(sizes)))).values.item()
-    return 1 / smallest if smallest > 0 else 0.0
+    return min(LONGEST, 1 / smallest) if smallest > 0 else LONGEST
 
 
 def _hexadecimal(seen: Tensor) -> str:

@@ -27,8 +27,8 @@ from mipmap_plugin.tiles.store import Store, write_pieces
 # The families whose splats lie in a PLY row by row, each the same for all views.
 KINDS: dict[str, type[VanillaModel]] = {"3dgs": VanillaModel, "2dgs": SurfelModel}
 
-# Splats from which is told what the scene needs of a backend.
-SAMPLE = 1000
+# Splats from which is told what the scene needs of a backend, and from where a capture was photographed: of those, a thousand have to be visible.
+SAMPLE = 8192
 
 
 def find_splats(path: Path) -> tuple[Checkpoint, type[VanillaModel]]:

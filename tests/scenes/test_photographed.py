@@ -6,43 +6,14 @@ from dataclasses import asdict, replace
 
 import pytest
 import torch
+from lone_capture import COUNT, FAR, cameras, capture, draws, table
 
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.adapted_scale import orbit_in
 from mipmap_plugin.scenes.orbits import ORBIT_FOV, Orbit
-from mipmap_plugin.scenes.photographed import CONTRAST, FARTHER, LEAST, SMALLEST, agreement, even_directions, photographed, seen_ways
-from mipmap_plugin.splatting.harmonics import basis
+from mipmap_plugin.scenes.photographed import CONTRAST, FARTHER, LEAST, LONGEST, SMALLEST, agreement, even_directions, photographed, seen_ways
 
-COUNT, FAR = 1500, 6.0
 CENTER = torch.zeros(3, dtype=torch.float64)
-
-
-def draws(seed: int) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
-def cameras(far: float = FAR) -> torch.Tensor:
-    """Places [C, 3] on the half of a ring around the scene, a little above it."""
-    turn = torch.linspace(0, math.pi, 24, dtype=torch.float64)
-    return far * torch.nn.functional.normalize(torch.stack([turn.cos(), torch.full_like(turn, -0.2), turn.sin()], 1), dim=1)
-
-
-def table() -> torch.Tensor:
-    """Places of splats [N, 3]: most on a table, a tenth far behind it."""
-    means = 4 * torch.rand(COUNT, 3, generator=draws(0), dtype=torch.float64) - 2
-    means[: COUNT // 10] *= 10
-    return means
-
-
-def capture(far: float = FAR) -> Gaussians:
-    """Splats whose colors are noise that was fitted toward the cameras: what steps of gradient descent from 0 can make of their bands."""
-    means = table()
-    rays = torch.nn.functional.normalize(means - cameras(far)[:, None], dim=2)
-    noise = torch.randn(len(rays), COUNT, 3, generator=draws(1), dtype=torch.float64)
-    sh = torch.einsum("vnk,vnc->nkc", basis(rays.flatten(0, 1), 3).unflatten(0, rays.shape[:2]), noise) / 100
-    sizes = 0.01 + 0.09 * torch.rand(COUNT, 1, generator=draws(2), dtype=torch.float64)
-    turned = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(COUNT, 4)
-    return Gaussians(means, turned, sizes.expand(COUNT, 3), torch.full((COUNT,), 0.8, dtype=torch.float64), sh)
 
 
 def by_chance(splats: Gaussians) -> Gaussians:
@@ -85,6 +56,14 @@ def test_the_smallest_splats_are_pixels_in_pictures_from_there():
     closest = torch.where(angle > math.cos(ORBIT_FOV / 2), depth, math.inf).amin(0)
     pixels = splats.scales[:, 0] * told.focal / closest
     assert (pixels[closest.isfinite()] < 1).double().mean() == pytest.approx(SMALLEST, abs=0.05)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9])
+def test_specks_that_no_picture_shows_ask_for_no_longer_lens_than_there_are(size):
+    splats = capture()
+    specks = replace(splats, scales=splats.scales.clone())
+    specks.scales[::4] = size
+    assert found(specks) == replace(found(splats), focal=LONGEST)
 
 
 @pytest.mark.parametrize(
@@ -133,9 +112,17 @@ def test_pictures_are_no_larger_than_asked_and_keep_their_detail():
     assert (small.height, small.width, small.fx) == (10, 20, pytest.approx(large.fx))
 
 
+def test_pictures_that_show_less_show_all_parts_of_what_a_photograph_would():
+    orbit = replace(Orbit.around(table(), sharp=lambda: 0.01).where_photographed(capture()), focal=1000.0)
+    views = [view for view in orbit.views((100, 100), 400, draws(8)) if view.fx == orbit.focal]  # of the near ones
+    side = 2 * 1000 * math.tan(ORBIT_FOV / 2)
+    for middles in ([50 - view.cx for view in views], [50 - view.cy for view in views]):
+        assert (min(middles), max(middles)) == pytest.approx((50 - side / 2, side / 2 - 50), abs=side / 20)
+
+
 def test_an_adapted_file_remembers_it():
     orbit = Orbit.around(table(), sharp=lambda: 0.01).where_photographed(capture())
     record = json.loads(json.dumps({"orbit": asdict(orbit)}))
     assert Orbit(**orbit_in(record)) == orbit
-    for wrong in ({"seen": "xyz"}, {"seen": "0"}, {"seen": "f" * 65}, {"focal": -1.0}):
+    for wrong in ({"seen": "xyz"}, {"seen": "0"}, {"seen": "f" * 65}, {"focal": -1.0}, {"focal": math.inf}):
         assert Orbit(**orbit_in({"orbit": record["orbit"] | wrong})) == replace(orbit, seen="", focal=0.0)

@@ -1,6 +1,7 @@
 """Without cameras a base and what is adapted from it are looked at from the same places."""
 
 import json
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -9,9 +10,11 @@ import torch
 from torch_checkpoints import gsplat_folder, splatfacto_folder, splats
 
 from mipmap_plugin import wrap_model
+from mipmap_plugin.adaptation.shown import orbited
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models.adapted_scale import adapted_orbit
+from mipmap_plugin.scenes.orbits import Orbit
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
@@ -149,6 +152,16 @@ def test_without_cameras_it_is_told_where_views_look_from(files, recwarn):
     around, above = [str(each.message) for each in recwarn if str(each.message).startswith("no cameras")]
     assert "from all around" in around and "say what is up (--up" in around
     assert "from above the horizon, with z up" in above and "--up" not in above
+
+
+def test_what_is_up_is_not_asked_for_where_colors_tell_from_where_to_look():
+    lying = Orbit((0.0, 0.0, 0.0), None, 2.0, nearest=1.0)
+    assert "--up" in orbited(None, lying) and "--up" not in orbited(None, replace(lying, seen="f", focal=500.0))
+
+
+def test_what_somebody_says_is_up_is_told_with_where_a_capture_was_photographed():
+    seen = Orbit((0.0, 0.0, 0.0), Z, 2.0, nearest=1.0, seen="f", focal=500.0)
+    assert ", with z up" in replace(seen, said=True).told() and "up" not in seen.told()
 
 
 @pytest.mark.parametrize(("floaters", "seems"), [(0, False), (1, True)], ids=["an object by itself", "splats far around it"])
