@@ -14,7 +14,7 @@ from mipmap_plugin.camera import Camera, viewmat_of
 from mipmap_plugin.effects import NEAR_PLANE
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.scenes.photographed import GOLDEN, photographed, seen_ways
+from mipmap_plugin.scenes.photographed import GOLDEN, SEEN_OPACITY, photographed, seen_ways
 
 ORBIT_FOV = math.radians(50)  # along the shorter side: a normal lens
 
@@ -37,7 +37,6 @@ WHOLE, TIGHT = 0.995, 1.4
 INNER, SHARP_PX, NEARER, MIDDLE = 1 / 2, 2.0, 1 / 2, 1 / 4
 WITHIN = 1 / 2  # colors tell 1 of four objects and 0.8 of one cut out of a capture, 0.15 to 0.35 of captures, their background cut off or not
 SHARP_FOCAL = 400 / math.tan(ORBIT_FOV / 2)  # of pictures of 800 px
-SEEN_OPACITY = 0.1
 
 # Largest ratio of the extent along y to those along x and z at which y is assumed to be vertical.
 FLATTER = 0.8

@@ -22,8 +22,8 @@ CELL = math.sqrt(4 * math.pi / DIRECTIONS) / 4  # how far around each of them vi
 # Places at multiples of the golden ratio are spread evenly, however many there are.
 GOLDEN = (math.sqrt(5) - 1) / 2
 
-# So many splats tell, evenly out of all; with fewer than LEAST chance decides.
-SAMPLE, LEAST = 1024, 1000
+# So many splats tell, evenly out of all that can be seen; with fewer than LEAST chance decides.
+SAMPLE, LEAST, SEEN_OPACITY = 1024, 1000, 0.1
 
 # A splat that has nothing toward an eye counts as one that has this part of its mean, so that few cannot decide for all.
 FLOOR = 0.05
@@ -115,7 +115,7 @@ def _telling(splats: Gaussians) -> Gaussians | None:
     if splats.covariances is not None or splats.sh.shape[1] < 2:
         return None
     finite = splats.means.isfinite().all(1) & splats.scales.isfinite().all(1) & splats.sh.isfinite().all(2).all(1)
-    rows = ((splats.opacities > 0.1) & finite & (splats.sh[:, 1:] != 0).any(2).any(1)).nonzero()[:, 0]
+    rows = ((splats.opacities >= SEEN_OPACITY) & finite & (splats.sh[:, 1:] != 0).any(2).any(1)).nonzero()[:, 0]
     if len(rows) < LEAST:
         return None
     rows = rows[torch.linspace(0, len(rows) - 1, min(SAMPLE, len(rows)), dtype=torch.float64).long()]
