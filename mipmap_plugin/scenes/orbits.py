@@ -35,11 +35,14 @@ WHOLE, TIGHT = 0.995, 1.4
 # show this size, the others at NEARER of it, but none is within the MIDDLE of the splats. Adapted to views that frame all splats, from up to 15 times
 # as far away as the cameras, a bird and flowers look worse than their bases from where they were photographed.
 INNER, SHARP_PX, NEARER, MIDDLE = 1 / 2, 2.0, 1 / 2, 1 / 4
-WITHIN = 1 / 2  # colors tell 1 of four objects and 0.8 of one cut out of a capture, 0.15 to 0.35 of captures, their background cut off or not
 SHARP_FOCAL = 400 / math.tan(ORBIT_FOV / 2)  # of pictures of 800 px
 
 # Largest ratio of the extent along y to those along x and z at which y is assumed to be vertical.
 FLATTER = 0.8
+
+# What is compact is a capture all the same if its colors tell that it was photographed from less than this part of the distance that frames it. They
+# tell 1 for two objects, 0.8 for one cut out of a capture, and 0.15 to 0.35 for captures whose background was cut off.
+WITHIN = 1 / 2
 
 # What pictures have upwards where nothing tells the vertical: as in most files, whose y is down (COLMAP).
 Y_DOWN = (0.0, -1.0, 0.0)
@@ -90,7 +93,7 @@ class Orbit:
     def where_photographed(self, splats: Gaussians) -> Orbit:
         """The orbit from where the colors of the splats tell that a capture was photographed; the same if they do not tell, and around an object.
 
-        What is compact, but was photographed from `WITHIN` the distance that frames it, is no object.
+        What is compact, but was photographed from near or from within (`WITHIN`), is no object.
         """
         center = torch.tensor(self.center, dtype=torch.float64)
         away = (_finite(splats.means) - center).norm(dim=1)
@@ -229,8 +232,8 @@ def _looking_at(target: Tensor, eye: Tensor, up: Tensor, size: tuple[int, int], 
 def _part(view: Camera, generator: torch.Generator) -> Camera:
     """A view that shows less than `ORBIT_FOV`, moved to anywhere in one that shows so much; any other as it is.
 
-    If all views showed the middle, at x1/4 the flowers would look up to 2.9 dB worse than their base from where they were photographed, with a
-    quarter of `ORBIT_FOV`; so they look better, by 0.3 dB and more.
+    If all views showed the middle alone, splats beside it would be adapted to nothing: with pictures of a quarter of that width, flowers at x1/4 lose
+    up to 2.9 dB in a view from where they were photographed, and gain 0.3 at least with pictures from anywhere in it.
     """
     whole = 2 * math.tan(ORBIT_FOV / 2) * view.fx / min(view.size)
     width, height = (int(side * (whole - 1)) for side in (view.width, view.height))

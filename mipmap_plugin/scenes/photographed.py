@@ -2,7 +2,7 @@
 
 Training fits the SH bands above 0 of a splat to the views that see it, and to no others. So toward an eye where a camera was, the squares of these
 bands are larger than their mean over all directions; and as one camera is seen in different directions by splats in different places, they tell how
-far away it was, too. In two captures the rank correlation between `agreement` and the distance to the nearest camera is -0.75 and -0.81.
+far away it was, too. In two captures the rank correlation between `agreement` and the distance to the nearest camera is -0.80 and -0.86.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SAMPLE, LEAST, SEEN_OPACITY = 1024, 1000, 0.1
 # A splat that has nothing toward an eye counts as one that has this part of its mean, so that few cannot decide for all.
 FLOOR = 0.05
 
-# The standard deviation of the agreement over all directions from which on it tells something: 0.15 to 0.6 in three captures and three objects, and
+# The standard deviation of the agreement over all directions from which on it tells something: 0.15 to 0.6 in three captures and two objects, and
 # 0.03 for colors by chance.
 CONTRAST = 0.1
 
