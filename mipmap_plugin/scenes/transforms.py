@@ -159,7 +159,7 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[View],
     notes += [elsewhere] if elsewhere else []
     if passed_over:
         notes.append(f"{file.name}: the intrinsics of {passed_over} of its frames are passed over for those of the file, as in nerfstudio")
-    if masked := sum(bool(frame.get("mask_path")) for frame in frames):
+    if masked := sum(bool(frame.get("mask_path")) for frame in every):
         notes.append(f"{file.name}: frames that are {MASKED} (mask_path): {masked}; masks are not read, so that what they hide counts like all else")
     return views, places, notes
 

@@ -77,10 +77,10 @@ def test_absent_images_whose_cameras_stay_are_counted_alone(tmp_path):
 
 
 def test_masks_are_told_of_for_they_are_not_read(tmp_path):
-    frames = [frame(mask_path="masks/r_0.png"), frame(mask_path=None)]
-    scene = read_transforms(write_json(tmp_path / "transforms.json", {"camera_angle_x": 0.8, "w": 40, "h": 30, "frames": frames}))
-    masked = "transforms.json: frames that are masked (mask_path): 1; masks are not read, so that what they hide counts like all else"
-    assert scene.warnings() == ["transforms.json: 2 listed images are absent", masked]
+    frames = {"frames": [frame(mask_path="masks/r_0.png"), frame(mask_path=None)], "test_frames": [frame(mask_path="masks/r_1.png")]}
+    scene = read_transforms(write_json(tmp_path / "transforms.json", {"camera_angle_x": 0.8, "w": 40, "h": 30, **frames}))
+    masked = "transforms.json: frames that are masked (mask_path): 2; masks are not read, so that what they hide counts like all else"
+    assert scene.warnings() == ["transforms.json: 3 listed images are absent", masked]
 
 
 def test_the_scale_of_a_cameras_axes_is_left_out(tmp_path):
