@@ -25,9 +25,8 @@ from mipmap_plugin.commands.inspect import inspect
 from mipmap_plugin.commands.levels import levels
 from mipmap_plugin.commands.list import list_
 from mipmap_plugin.commands.render import render
-from mipmap_plugin.commands.repeated import refuse_repeated
 from mipmap_plugin.commands.tradeoff import tradeoff
-from mipmap_plugin.commands.types import RULES
+from mipmap_plugin.commands.types import RULES, refuse_repeated
 from mipmap_plugin.commands.view import view
 from mipmap_plugin.errors import MipmapPluginError, SettingsError, hide_others_warnings, of_a_file, unknown
 from mipmap_plugin.formats.here import told_from_here

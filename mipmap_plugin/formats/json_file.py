@@ -28,8 +28,6 @@ def read_json(path: Path) -> Any:
         if trouble := no_file(path):
             raise SceneError(f"{path}: {trouble}; check the path")
         content = path.read_bytes()
-    except SceneError:
-        raise
     except OSError as error:
         raise SceneError(f"{path}: cannot be read ({error.strerror}); check the path") from error
     if content.startswith(LFS_POINTER):

@@ -17,16 +17,13 @@ KIRI = "KIRI's add-on for Blender reads PLYs only"
 # Viewers that read PLYs, and no other format that is written here.
 PLY_ONLY = ("3dgs.cpp", "web-splat", "splatapult")
 
-
 # Viewers that open no file of splats by itself.
 TILES_ONLY = {"cesium": "Cesium opens splats in 3D Tiles only, which levels --tiles writes"}
 
 
 def _read_no(ending: str, *viewers: str) -> dict[str, str]:
     told = {"mip": NOT_IN_PLY.format(ending), "kiri": KIRI, **TILES_ONLY}
-    told |= dict.fromkeys(
-        ("antimatter15", "aframe", "gsplat-js"), f"antimatter15/splat, aframe-gaussian-splatting and gsplat.js read no {ending}"
-    )
+    told |= dict.fromkeys(("antimatter15", "aframe", "gsplat-js"), f"antimatter15/splat, aframe-gaussian-splatting and gsplat.js read no {ending}")
     return told | {viewer: f"{viewer} reads no {ending}" for viewer in (*PLY_ONLY, *viewers)}
 
 

@@ -164,18 +164,16 @@ def write_exchange(path: Path, write: Callable[[Path], Any], *, overwrite: bool)
 
 def _convert(tool: Sequence[str], plain: Path, converted: Path, path: Path) -> None:
     """Convert a PLY by splat-transform. Raises OutputError, naming the output `path`."""
-    kind = next(kind for kind, (_, suffix) in EXCHANGE.items() if converted.name.endswith(suffix))
-    as_it_is = None
-    if kind == "spz":
-        from mipmap_plugin.formats.ply import read_ply  # as above
-        from mipmap_plugin.formats.spz import refine
+    from mipmap_plugin.formats.ply import read_ply  # as above
+    from mipmap_plugin.formats.spz import refine
 
-        as_it_is = read_ply(plain).columns  # in the frame of the file
+    kind = next(kind for kind, (_, suffix) in EXCHANGE.items() if converted.name.endswith(suffix))
+    columns = read_ply(plain).columns if kind == "spz" else {}  # in the frame of the file
     _settle_frame(tool, converted, plain)
     if reason := _run(tool, [plain], converted):
         raise OutputError(f"{path}: {TOOL} does not write it ({reason})")
-    if as_it_is is not None:
-        refine(converted, as_it_is)
+    if columns:
+        refine(converted, columns)
     if _mode(plain) == "antialiased" and not _mode(converted, kind):
         mark_antialiased(converted)
 

@@ -57,7 +57,7 @@ def _read(stream: IO[bytes], requests: queue.SimpleQueue[Request]) -> None:
 
 def _leave(number: int, frame: object) -> None:
     """What Ctrl-C does where no job can be lost."""
-    os._exit(130)
+    os._exit(INTERRUPTED)
 
 
 def _run_quietly(job: Job, threads: int | None) -> Outcome:

@@ -16,19 +16,7 @@ from mipmap_plugin.errors import CheckpointError, PluginError, ShapeError, type_
 from mipmap_plugin.formats.atomic import staged
 from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import (
-    CARRIED,
-    OF_3DGS,
-    PARAMETERS,
-    Filtered,
-    Placed,
-    Rebuilt,
-    SplatModel,
-    Thinned,
-    TrainedScale,
-    Traits,
-    tensors_of,
-)
+from mipmap_plugin.models.base import CARRIED, OF_3DGS, PARAMETERS, Filtered, Placed, Rebuilt, SplatModel, Thinned, TrainedScale, Traits, tensors_of
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.plugin_errors import is_third_party, naming, naming_any
 from mipmap_plugin.splatting.eigen import by_axes

@@ -16,7 +16,7 @@ from mipmap_plugin.models import splatfacto
 from mipmap_plugin.models.anchors.companions import NEEDED
 from mipmap_plugin.models.anchors.networks import Weights
 from mipmap_plugin.models.anchors.scaffold import scaffold_in_memory
-from mipmap_plugin.models.base import CARRIED, SplatModel, TrainedScale, tensors_of
+from mipmap_plugin.models.base import CARRIED, OF_3DGS, SplatModel, TrainedScale, tensors_of
 from mipmap_plugin.models.contract import OPACITY_ROUNDING, lacking
 from mipmap_plugin.models.gsplat import model as gsplat
 from mipmap_plugin.models.health import holds_splats, rows_where
@@ -106,7 +106,7 @@ def adopt(model: Any) -> SplatModel:
     if set(splatfacto.NAMES) <= set(tensors):
         raw = splatfacto.to_parameters(_copied(model, {name: tensors[name] for name in splatfacto.NAMES}))
         return _adopted(model, raw, TrainedScale(near_plane=splatfacto.NEAR_PLANE, up=splatfacto.UP), Origin())
-    if set(gsplat.NAMES) == set(tensors):
+    if set(OF_3DGS) == set(tensors):
         return _adopted(model, _copied(model, tensors), TrainedScale(near_plane=gsplat.NEAR_PLANE, up=gsplat.UP), Origin(host=gsplat.GsplatHost()))
     content = f" with {', '.join(map(str, list(tensors)[:8]))}" if tensors else ""
     raise SettingsError(f"{type_of(model)}{content} is not a known kind of model; {_advice(model, tensors)}")
@@ -135,9 +135,9 @@ def _advice(model: Any, tensors: Mapping[str, Any]) -> str:
     if callable(getattr(getattr(model, "model", None), "gaussians", None)):  # what is wrapped, or adapted
         return "give its attribute `model`"
     if "means" in tensors:
-        lacks, beside = (", ".join(sorted(map(str, names))) for names in (set(gsplat.NAMES) - set(tensors), set(tensors) - set(gsplat.NAMES)))
+        lacks, beside = (", ".join(sorted(map(str, names))) for names in (set(OF_3DGS) - set(tensors), set(tensors) - set(OF_3DGS)))
         unlike = [f"lacks {lacks}"] * bool(lacks) + [f"has {beside} besides"] * bool(beside)
-        return f"gsplat's dictionary has {', '.join(gsplat.NAMES)} (for SH degree 0 shN is empty, [N, 0, 3]), and this one {' and '.join(unlike)}"
+        return f"gsplat's dictionary has {', '.join(OF_3DGS)} (for SH degree 0 shN is empty, [N, 0, 3]), and this one {' and '.join(unlike)}"
     return "give a path, a GaussianModel, gsplat's dictionary of splats, or nerfstudio's model"
 
 

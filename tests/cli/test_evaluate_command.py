@@ -11,8 +11,7 @@ from pages_read import record_of
 
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.commands.adapt import adapt
-from mipmap_plugin.commands.repeated import refuse_repeated
-from mipmap_plugin.commands.types import read_scale
+from mipmap_plugin.commands.types import read_scale, refuse_repeated
 from mipmap_plugin.evaluation.published import PUBLISHED
 from mipmap_plugin.scenes import write_cameras
 

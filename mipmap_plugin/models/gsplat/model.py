@@ -19,7 +19,7 @@ from mipmap_plugin.formats.atomic import new_folder, sha256
 from mipmap_plugin.formats.tags import render_mode
 from mipmap_plugin.formats.torch_file import load_torch, save_torch, step_and_comments
 from mipmap_plugin.formats.yaml_scalars import read_scalars, with_scalar
-from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.base import OF_3DGS, TrainedScale
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.gsplat.frame import normalized_frame
 from mipmap_plugin.models.hosts import Capture, held_out
@@ -31,7 +31,6 @@ from mipmap_plugin.models.vanilla import Origin, VanillaModel
 
 PLACE, FILE = GSPLAT
 
-NAMES = ("means", "scales", "quats", "opacities", "sh0", "shN")
 
 # World units, the trainer's default.
 NEAR_PLANE = 0.01
@@ -119,7 +118,7 @@ def load_gsplat(path: str | Path, *, iteration: int | None = None) -> VanillaMod
     origin = Origin(files[0], sha256(*files), checkpoint.folder, checkpoint.iteration, comments, host=host)
     parts = [_parameters(shard["splats"], file) for shard, file in zip(shards, files, strict=True)]
     try:
-        parameters = {name: torch.cat([part[name] for part in parts]) for name in NAMES}
+        parameters = {name: torch.cat([part[name] for part in parts]) for name in OF_3DGS}
         flat = str(options.get("model_type", "")).startswith("2dgs")
         trained = _trained(options)
         kind, trained = (SurfelModel, flat_trained(trained)) if flat else (VanillaModel, as_tagged(trained, comments))
@@ -158,11 +157,11 @@ def _parameters(splats: Mapping[str, Tensor], path: Path) -> dict[str, Tensor]:
     if {"features", "colors"} & set(named):
         advice = "train without app_opt, or export a PLY from gsplat (save_ply), which bakes one appearance"
         raise CheckpointError(f"{path} was trained with app_opt: a network of gsplat colors its splats, which is not read here; {advice}")
-    if set(named) == set(NAMES) and (wrong := [name for name, value in named.items() if not torch.is_tensor(value)]):
+    if set(named) != set(OF_3DGS):
+        raise CheckpointError(f"{path} holds the splat tensors {', '.join(map(str, named))}; expected are {', '.join(OF_3DGS)}")
+    if wrong := [name for name, value in named.items() if not torch.is_tensor(value)]:
         raise CheckpointError(f"{path}: {', '.join(wrong)} should be tensors; save the checkpoint again as gsplat's simple_trainer does")
-    if set(named) != set(NAMES):
-        raise CheckpointError(f"{path} holds the splat tensors {', '.join(map(str, named))}; expected are {', '.join(NAMES)}")
-    return {name: named[name].detach().float() for name in NAMES}
+    return {name: named[name].detach().float() for name in OF_3DGS}
 
 
 def _shrunk(cameras: Sequence[Camera], factor: int, capture: Capture) -> list[Camera]:
