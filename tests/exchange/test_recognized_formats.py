@@ -11,6 +11,7 @@ import pytest
 import tiny
 from exchange_files import RECORD, SPZ, answer_by, sentence, tool_request
 from ply_files import write, write_splats
+from zip_files import archive
 
 from mipmap_plugin.errors import CheckpointError, OutputError
 from mipmap_plugin.formats.ply import read_ply
@@ -93,9 +94,9 @@ def test_the_adaptation_of_a_file_with_another_ending_is_a_ply(tmp_path, name, a
 
 
 def test_a_sog_whose_checksums_are_wrong_is_refused(tmp_path, tool):
-    with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
-        archive.writestr("meta.json", json.dumps({"version": 2, "means": {"files": ["means_l.webp"]}}))
-        archive.writestr("means_l.webp", b"abcd")
+    with zipfile.ZipFile(tmp_path / "a.sog", "w") as stored:
+        stored.writestr("meta.json", json.dumps({"version": 2, "means": {"files": ["means_l.webp"]}}))
+        stored.writestr("means_l.webp", b"abcd")
     (tmp_path / "a.sog").write_bytes((tmp_path / "a.sog").read_bytes().replace(b"abcd", b"abce"))
     with pytest.raises(CheckpointError, match=r"is damaged \(the checksum of means_l.webp is wrong\)"):
         load_model(tmp_path / "a.sog")
@@ -124,9 +125,7 @@ def test_a_bomb_is_not_unpacked(tmp_path, tool, packed):
     if packed == "spz":
         path.write_bytes(gzip.compress(SPZ + bytes(1 << 20)))
     else:
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("meta.json", content)
-            archive.writestr("means_l.webp", bytes(1 << 20))
+        archive(path, {"meta.json": content, "means_l.webp": bytes(1 << 20)})
     assert "is damaged (it would be more than 100 times as large unpacked" in sentence(path)
     assert not (tool / "asked.json").exists()
 
@@ -134,9 +133,7 @@ def test_a_bomb_is_not_unpacked(tmp_path, tool, packed):
 @pytest.mark.parametrize("where", ["a.sog", "room", "room/meta.json"])
 def test_sog_as_a_file_and_as_a_folder(tmp_path, tool, where):
     meta = json.dumps({"version": 2, "means": {"files": ["means_l.webp", "means_u.webp"]}})
-    with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
-        archive.writestr("meta.json", meta)
-        archive.writestr("means_l.webp", "")
+    archive(tmp_path / "a.sog", {"meta.json": meta, "means_l.webp": ""})
     (tmp_path / "room").mkdir()
     (tmp_path / "room/meta.json").write_text(meta)
     assert len(load_model(tmp_path / where)) == 60

@@ -5,7 +5,6 @@ import json
 import math
 import shutil
 import subprocess
-import zipfile
 from dataclasses import replace
 
 import gltf_files
@@ -15,6 +14,7 @@ import tiny
 import torch
 from exchange_files import RECORD, SPZ, sentence
 from ply_files import write
+from zip_files import archive
 
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.ply import read_ply, write_ply
@@ -112,10 +112,8 @@ def old_tool(tool):
 
 
 def as_sog(path, model):
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("a/meta.json", json.dumps({"version": 2, "model": model, "means": {"files": ["means_l.webp"]}}))
-        archive.writestr("a/means_l.webp", b"abcd")
-    return path
+    meta = {"version": 2, "model": model, "means": {"files": ["means_l.webp"]}}
+    return archive(path, {"a/meta.json": json.dumps(meta), "a/means_l.webp": b"abcd"})
 
 
 @pytest.mark.parametrize("flag", [0, 1, 2, 3])

@@ -2,7 +2,6 @@
 
 import errno
 import tempfile
-import zipfile
 from unittest.mock import Mock
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 import tiny
 import torch
 from ply_files import write
+from zip_files import archive, packed
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.cli import main
@@ -21,12 +21,6 @@ from mipmap_plugin.models import detect, load_model, zipped_folder
 pytestmark = pytest.mark.usefixtures("few_views")
 
 
-def archive(path, files):
-    """A zip archive of files, by their names in it."""
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as opened:
-        for name, content in files.items():
-            opened.writestr(name, content)
-    return path
 
 
 @pytest.fixture
@@ -104,10 +98,6 @@ def folder(tmp_path):
     return tiny.folder(tmp_path / "trained" / "model")
 
 
-def packed(path, folder, top="my model", beside=None):
-    """A zip archive of a model folder, which is called `top` in it."""
-    files = {f"{top}/{file.relative_to(folder)}" if top else str(file.relative_to(folder)): file for file in folder.rglob("*") if file.is_file()}
-    return archive(path, {name: file.read_bytes() for name, file in files.items()} | (beside or {}))
 
 
 @pytest.mark.parametrize("top", ["my model", "", "../../up", "deep/er"])

@@ -176,7 +176,8 @@ def test_cameras_of_each_scene(run, tmp_path):
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        ("--scale 4", "there is no checkpoint to adapt"),
+        ("", "there is no checkpoint to adapt; give a PLY"),
+        ("--scale 4", "there is no checkpoint to adapt; give a PLY"),
         ("a.ply b.ply", "give --scale"),
         ("a.ply b.ply --scale 4 --bytes 2MB", "one checkpoint at a time"),
         ("a.ply b.ply --scale 4 --report", "one checkpoint at a time"),
@@ -204,9 +205,6 @@ def test_what_is_wrong_for_all_is_said_before_any_work(run, tmp_path, monkeypatc
     assert (code, out) == (2, "") and reason in err and err.count("\n") == 1
 
 
-def test_without_words_a_checkpoint_is_asked_for(run):
-    code, _, err = run("adapt")
-    assert code == 2 and "there is no checkpoint to adapt; give a PLY" in err
 
 
 # Lists

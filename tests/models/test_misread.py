@@ -1,14 +1,13 @@
 """Files of related projects, and side files: read as what they are, or refused by name."""
 
 import json
-import zipfile
 
 import numpy as np
-import ply_files
 import pytest
 import torch
 from ply_files import splat_columns, write, write_model_folder, write_splats
-from torch_checkpoints import gsplat_folder, splats
+from torch_checkpoints import gsplat_folder, live_model, splats
+from zip_files import archive
 
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.cfg_args import read_cfg_args
@@ -82,9 +81,6 @@ def test_a_ply_of_3dgrut_is_read_with_a_note(tmp_path):
     assert not any("3DGRUT" in note for note in load_model(write(tmp_path / "b.ply", {**COLUMNS, **askew})).notes)
 
 
-def archive(path, name):
-    with zipfile.ZipFile(path, "w") as held:
-        held.writestr(name, "{}")
 
 
 ADAM = {"state": {}, "param_groups": [{"params": [0], "name": name} for name in ("xyz", "t", "scaling_t", "rotation_r")]}
@@ -96,10 +92,10 @@ OTHERS = {
         r"3DGRUT.*give the PLY that it exports",
     ),
     **{
-        f"a.{ending}": (lambda path: archive(path, "default.usda"), "is USD, which is not read here; export a PLY")
+        f"a.{ending}": (lambda path: archive(path, {"default.usda": "{}"}), "is USD, which is not read here; export a PLY")
         for ending in ("usd", "usda", "usdc", "usdz")
     },
-    "a.ssproj": (lambda path: archive(path, "document.json"), r"is a project of SuperSplat, .* export a PLY"),
+    "a.ssproj": (lambda path: archive(path, {"document.json": "{}"}), r"is a project of SuperSplat, .* export a PLY"),
     "merged.hier": (lambda path: path.write_bytes(bytes(range(7)) * 9), r"Hierarchical 3D Gaussians.*trained_chunks"),
 }
 
@@ -160,24 +156,7 @@ def test_options_that_gsplat_did_not_use_have_no_note(tmp_path):
     assert load_model(folder).notes == plain
 
 
-class DeformableGaussianModel:
-    """Of Deformable 3D Gaussians: the tensors of 3DGS, without `capture`; the network is another object."""
-
-    def __init__(self):
-        raw = splats()
-        self._xyz, self._scaling, self._rotation, self._opacity = raw["means"], raw["scales"], raw["quats"], raw["opacities"][:, None]
-        self._features_dc, self._features_rest = raw["sh0"], raw["shN"]
-
-
-class InriaGaussianModel(DeformableGaussianModel):
-    def capture(self):
-        return ()
-
-
 def test_a_live_canonical_cloud_is_taken_with_a_note():
-    assert any("Deformable" in note for note in adopt(DeformableGaussianModel()).notes)
-    assert not any("Deformable" in note for note in adopt(InriaGaussianModel()).notes)
-
-
-def test_a_file_of_splats_is_still_one(tmp_path):
-    assert detect(ply_files.write_splats(tmp_path / "a.ply")).family == "3dgs"
+    """The class of Deformable 3D Gaussians has the tensors of 3DGS, without `capture`; the network is another object."""
+    assert any("Deformable" in note for note in adopt(live_model(splats())).notes)
+    assert not any("Deformable" in note for note in adopt(live_model(splats(), capture=tuple)).notes)

@@ -10,6 +10,7 @@ import torch
 from oracle import color_one
 from samples import camera, gaussians, leaves
 from surfel_checkpoints import columns, folder
+from torch_checkpoints import live_model
 
 from mipmap_plugin.adaptation.start.surfel_form import visible_area, widened_for_slant
 from mipmap_plugin.backends import choose_backend, survey
@@ -249,17 +250,9 @@ def test_merging_returns_fewer_splats_that_are_flat(tmp_path):
     assert "scale_2" not in read_ply(adapted.save(tmp_path / "a.ply")).columns
 
 
-class GaussianModel:
-    """What the class of 2DGS holds after training."""
-
-    def __init__(self):
-        raw = tiny.model().parameters()
-        self._xyz, self._scaling, self._rotation = raw["means"], raw["scales"][:, :2].clone(), raw["quats"]
-        self._opacity, self._features_dc, self._features_rest = raw["opacities"][:, None], raw["sh0"], raw["shN"]
-
-
 def test_a_live_object_is_recognized_by_its_two_scales():
-    live = GaussianModel()
+    raw = tiny.model().parameters()
+    live = live_model(raw | {"scales": raw["scales"][:, :2].clone()})
     model = adopt(live)
     assert isinstance(model, SurfelModel) and model.trained.screen_filter == "surfel"
     assert torch.equal(model.parameters()["scales"][:, :2], live._scaling)

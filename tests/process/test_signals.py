@@ -10,12 +10,12 @@ import subprocess
 import sys
 import time
 import weakref
-import zipfile
 from unittest.mock import Mock
 
 import pressing
 import pytest
 import tiny
+from zip_files import packed
 
 from mipmap_plugin.adaptation.optimization.interrupt import interruptible
 from mipmap_plugin.cli import main
@@ -53,15 +53,10 @@ def _usual_signals():
         signal.signal(number, handler)
 
 
-def zipped(folder, archive):
-    with zipfile.ZipFile(archive, "w") as opened:
-        for file in folder.rglob("*"):
-            opened.write(file, file.relative_to(folder.parent))
-    return archive
 
 
 def test_what_was_unpacked_is_removed(tmp_path):
-    zipped(tiny.folder(tmp_path / "base"), tmp_path / "base.zip")
+    packed(tmp_path / "base.zip", tiny.folder(tmp_path / "base"))
     (tmp_path / "unpacked").mkdir()
     environment = {**os.environ, "TMPDIR": str(tmp_path / "unpacked"), "PYTHONPATH": os.pathsep.join(sys.path)}
     ended = subprocess.run([sys.executable, "-c", TOLD_TO_END], cwd=tmp_path, env=environment, capture_output=True, text=True)

@@ -1,6 +1,7 @@
 """Checkpoints of gsplat and splatfacto, written from seeded weights exactly as the two projects write them."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -153,3 +154,9 @@ def normalized_by_numpy(cameras, points):
     second = np.eye(4)
     second[:3, :3], second[:3, 3] = vectors.T, -vectors.T @ centroid
     return second @ first
+
+
+def live_model(raw: dict[str, Tensor], **more) -> SimpleNamespace:
+    """An object with the tensors of INRIA's GaussianModel, and `more` attributes."""
+    named = {"_xyz": "means", "_scaling": "scales", "_rotation": "quats", "_features_dc": "sh0", "_features_rest": "shN"}
+    return SimpleNamespace(**{name: raw[own] for name, own in named.items()}, _opacity=raw["opacities"][:, None], **more)
