@@ -16,6 +16,7 @@ import uuid
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 from weakref import WeakSet
@@ -29,6 +30,7 @@ from mipmap_plugin.jobs.finished import finished
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.parcel import Delivery, Parcel, do_parcel, pack, unpack
 from mipmap_plugin.jobs.worker import Worker, do
+from mipmap_plugin.process.signals import ctrl_c_does
 from mipmap_plugin.progress import meanwhile, note
 
 PACKAGE = "mipmap-plugin"
@@ -68,7 +70,7 @@ def on_dask(jobs: Sequence[Job], place: str, threads: int | None = None, *, send
     """
     jobs, stopping = longest_first(jobs), threading.Event()
     given: WeakSet[Future[Outcome | Delivery]] = WeakSet()  # workers keep the outcome, with its files, of each task whose future is kept
-    with _connected(place) as client, _kept_workers(client, place, lambda: stopping.is_set() and client.cancel(list(given))):
+    with _connected(place) as client, meanwhile(partial(_keep_workers, client, place, lambda: stopping.is_set() and client.cancel(list(given)))):
         client.wait_for_workers(1)  # which says whether files have to be sent, and whether there are GPUs
         _refuse_other_versions(client, place)
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
@@ -145,22 +147,16 @@ def _task(sent: Job | Parcel, threads: int | None, stop_name: str) -> Outcome | 
         worker = _mine.worker = Worker(threads)
     if stop.is_set():
         return Outcome(sent.job if isinstance(sent, Parcel) else sent, "interrupted", reason="interrupted")
-    with _stopped_by(stop, worker):
+    with meanwhile(partial(_stop_with, stop, worker)):
         return do_parcel(sent, lambda job: do(job, worker)) if isinstance(sent, Parcel) else do(sent, worker)
 
 
-@contextmanager
-def _stopped_by(stop: Event, worker: Worker) -> Iterator[None]:
-    """Inside, the worker is stopped once `stop` is set."""
-
-    def watch(ended: threading.Event) -> None:
-        while not ended.wait(PERIOD_S):
-            with suppress(OSError, asyncio.TimeoutError):  # a scheduler that cannot be reached now
-                if stop.is_set():
-                    return worker.stop()
-
-    with meanwhile(watch):
-        yield
+def _stop_with(stop: Event, worker: Worker, ended: threading.Event) -> None:
+    """Stop the worker once `stop` is set, unless its job has `ended` before."""
+    while not ended.wait(PERIOD_S):
+        with suppress(OSError, asyncio.TimeoutError):  # a scheduler that cannot be reached now
+            if stop.is_set():
+                return worker.stop()
 
 
 def _outcome(future: Future[Outcome | Delivery], job: Job) -> Outcome:
@@ -182,7 +178,8 @@ def _connected(place: str) -> Iterator[Client]:
     if place.startswith("local:"):
         if not re.fullmatch(r"local:0*[1-9]\d*", place):
             raise SettingsError(f"--dask {place}: after local: goes the number of workers, at least 1; give local:4 for four workers here")
-        with _without_interrupts(), dask.config.set(LOCAL):
+        # Its processes ignore Ctrl-C, which the terminal sends to all of them: this process alone decides what ends.
+        with ctrl_c_does(signal.SIG_IGN), dask.config.set(LOCAL):
             cluster = LocalCluster(
                 n_workers=int(place[6:]), threads_per_worker=1, memory_limit=0, dashboard_address=":0", silence_logs=logging.CRITICAL
             )
@@ -197,37 +194,18 @@ def _connected(place: str) -> Iterator[Client]:
         yield client
 
 
-@contextmanager
-def _kept_workers(client: Client, place: str, forsaken: Callable[[], object]) -> Iterator[None]:
-    """Inside, look regularly whether there are workers: at each look that finds none call `forsaken`, and at the second in a row write a line.
+def _keep_workers(client: Client, place: str, forsaken: Callable[[], object], ended: threading.Event) -> None:
+    """Look regularly whether there are workers: at each look that finds none call `forsaken`, and at the second in a row write a line.
 
     Also replace workers of this machine that died, as dask does itself except for one that dies while it starts.
     """
-
-    def watch(ended: threading.Event) -> None:
-        looks = 0
-        while not ended.wait(LOOK_S):
-            if client.cluster is not None:
-                client.cluster.scale(len(client.cluster.worker_spec))
-            with suppress(OSError, asyncio.TimeoutError):  # a scheduler that cannot be reached now is found again, or ends the jobs
-                looks = 0 if client.scheduler_info(n_workers=1)["workers"] else looks + 1
-                if looks:
-                    forsaken()
-                if looks == 2:
-                    note(f"--dask {place}: there are no workers, so nothing is done until one comes; Ctrl-C ends this, and the same command goes on")
-
-    with meanwhile(watch):
-        yield
-
-
-@contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Processes that are started inside ignore Ctrl-C, which the terminal sends to all of them: this process alone decides what ends."""
-    if threading.current_thread() is not threading.main_thread():  # which alone may change what signals do
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
+    looks = 0
+    while not ended.wait(LOOK_S):
+        if client.cluster is not None:
+            client.cluster.scale(len(client.cluster.worker_spec))
+        with suppress(OSError, asyncio.TimeoutError):  # a scheduler that cannot be reached now is found again, or ends the jobs
+            looks = 0 if client.scheduler_info(n_workers=1)["workers"] else looks + 1
+            if looks:
+                forsaken()
+            if looks == 2:
+                note(f"--dask {place}: there are no workers, so nothing is done until one comes; Ctrl-C ends this, and the same command goes on")

@@ -13,13 +13,12 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stderr
+from contextlib import redirect_stderr
 from typing import IO
 
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.process.freed_memory import keep_freed_memory
-from mipmap_plugin.process.signals import INTERRUPTED, Ending, ends_as_by_ctrl_c
+from mipmap_plugin.process.signals import INTERRUPTED, Ending, ctrl_c_does, ends_as_by_ctrl_c
 
 Request = tuple[Job, "int | None"]
 
@@ -67,20 +66,12 @@ def _run_quietly(job: Job, threads: int | None) -> Outcome:
         try:
             from mipmap_plugin.jobs.run import run  # not interruptible: what it loads, torch among it, may swallow a KeyboardInterrupt
 
-            with _interruptible():
+            with ctrl_c_does(signal.default_int_handler):
                 return run(job, threads)
         except KeyboardInterrupt as interrupt:
             return Outcome(job, "interrupted", reason=str(interrupt) or "interrupted", seconds=time.perf_counter() - began)
 
 
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """Inside, Ctrl-C raises KeyboardInterrupt."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, _leave)
 
 
 if __name__ == "__main__":

@@ -9,9 +9,10 @@ import sys
 import threading
 import time
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 # Signals whose default is to end a process at once; Windows lacks SIGHUP, and alone has SIGBREAK: Ctrl-Break, or a console that is closed.
 SIGNALS = [signal.Signals[name] for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if name in signal.Signals.__members__]
@@ -103,6 +104,19 @@ def presses() -> Presses:
 def is_ours(handler: object) -> bool:
     """Whether a handler of Ctrl-C is Python's own, or that of a command, and not of a program that this package is used in."""
     return handler is signal.default_int_handler or isinstance(getattr(handler, "__self__", None), Ending)
+
+
+@contextmanager
+def ctrl_c_does(handler: Callable[[int, FrameType | None], Any] | signal.Handlers) -> Iterator[None]:
+    """Inside, Ctrl-C does this, and in processes that are started inside what these inherit of it (SIG_IGN); in another thread nothing changes."""
+    if threading.current_thread() is not threading.main_thread():  # which alone may change what signals do
+        yield
+        return
+    before = signal.signal(signal.SIGINT, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

@@ -9,6 +9,7 @@ import weakref
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import PackageNotFoundError
 from types import SimpleNamespace
 
@@ -22,6 +23,7 @@ from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.run import run
+from mipmap_plugin.progress import meanwhile
 
 pytest.importorskip("distributed")
 
@@ -113,7 +115,7 @@ def test_a_worker_that_dies_while_it_starts_is_replaced(monkeypatch):
     monkeypatch.setattr(farm, "LOOK_S", 0.2)
     monkeypatch.setitem(farm.LOCAL, "distributed.deploy.lost-worker-timeout", "1 s")
     instantiate = Nanny.instantiate
-    with farm._connected("local:2") as client, farm._kept_workers(client, "local:2", lambda: None):
+    with farm._connected("local:2") as client, meanwhile(partial(farm._keep_workers, client, "local:2", lambda: None)):
 
         async def dies(nanny):
             monkeypatch.setattr(Nanny, "instantiate", instantiate)  # the next one lives
@@ -170,7 +172,7 @@ def test_that_no_worker_is_there_is_said_once(monkeypatch, capsys):
     looks = []
     client = SimpleNamespace(cluster=None, scheduler_info=lambda n_workers: looks.append(n_workers) or {"workers": {}})
     monkeypatch.setattr(farm, "LOOK_S", 0.001)
-    with farm._kept_workers(client, "tcp://somewhere:8786", lambda: None):
+    with meanwhile(partial(farm._keep_workers, client, "tcp://somewhere:8786", lambda: None)):
         wait_until(lambda: len(looks) > 4)
     assert capsys.readouterr().err.count("there are no workers") == 1
 
