@@ -31,15 +31,15 @@ INTERRUPTED = 130
 
 
 class Presses:
-    """When Ctrl-C was pressed."""
+    """When Ctrl-C was pressed, or the process was told to end."""
 
-    def __init__(self) -> None:
-        self._at = -TWICE_S
+    def __init__(self, same_s: float) -> None:
+        self._same_s, self._at = same_s, -same_s
 
     def is_new(self) -> bool:
-        """Whether this press counts: within TWICE_S of the last one that counted, it is taken for the same."""
+        """Whether this press counts: within `same_s` seconds of the last one that counted, it is taken for the same."""
         now = time.monotonic()
-        if now - self._at < TWICE_S:
+        if now - self._at < self._same_s:
             return False
         self._at = now
         return True
@@ -51,8 +51,7 @@ class Ending:
     code = INTERRUPTED  # to exit with
 
     def __init__(self) -> None:
-        self._heard_at = -SAME_S
-        self.presses = Presses()
+        self.presses, self._told = Presses(TWICE_S), Presses(SAME_S)
 
     def pressed(self, number: int, frame: FrameType | None) -> None:
         """Raise KeyboardInterrupt, but not a second time in the middle of what the first one has removed or kept.
@@ -68,10 +67,9 @@ class Ending:
 
     def heard(self, number: int, frame: FrameType | None) -> None:
         """Do what Ctrl-C does now; also where that is ignored, as by what a script starts in the background."""
-        now = time.monotonic()
-        if now - self._heard_at < SAME_S:
+        if not self._told.is_new():
             return
-        self._heard_at, self.code = now, 128 + number
+        self.code = 128 + number
         on_ctrl_c = signal.getsignal(signal.SIGINT)
         if not callable(on_ctrl_c):
             raise KeyboardInterrupt
@@ -98,7 +96,7 @@ def _press_again() -> None:
 def presses() -> Presses:
     """The presses of the running command, which all of its parts share, so that each press counts once; outside of a command, a new record."""
     ending = getattr(signal.getsignal(signal.SIGINT), "__self__", None)
-    return ending.presses if isinstance(ending, Ending) else Presses()
+    return ending.presses if isinstance(ending, Ending) else Presses(TWICE_S)
 
 
 def is_ours(handler: object) -> bool:
