@@ -10,6 +10,7 @@ import torch
 
 from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS
 from mipmap_plugin.backends import BACKENDS
+from mipmap_plugin.cli import main
 from mipmap_plugin.levels.ladder import NOT_BETTER
 from mipmap_plugin.models.families import FAMILIES
 from mipmap_plugin.process.garbage import leave_loaded, uncollected
@@ -66,6 +67,22 @@ def nothing_that_is_registered_stays():
 def small_orbits(monkeypatch):
     """Views of a generated orbit have 24 px, in place of 800: no test of a file without cameras is about its pictures."""
     monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 24)
+
+
+@pytest.fixture
+def run(capsys):
+    """Call the command line; return (exit code, what it said on stdout, what on stderr)."""
+
+    def call(*words):
+        capsys.readouterr()
+        try:
+            code = main([str(word) for word in words])
+        except SystemExit as leaving:  # how the argument parser ends
+            code = leaving.code
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return call
 
 
 @pytest.fixture

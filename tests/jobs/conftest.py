@@ -1,22 +1,7 @@
-"""The command line and scenes, for tests of jobs."""
+"""Scenes, for tests of jobs."""
 
 import pytest
 import tiny
-
-from mipmap_plugin.cli import main
-
-
-@pytest.fixture
-def run(capsys):
-    """Call the command line; return (exit code, what it said on stdout, what on stderr)."""
-
-    def call(*words):
-        capsys.readouterr()
-        code = main([str(word) for word in words])
-        said = capsys.readouterr()
-        return code, said.out, said.err
-
-    return call
 
 
 @pytest.fixture
