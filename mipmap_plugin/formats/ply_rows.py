@@ -42,9 +42,11 @@ class PlyRows:
 
 def body_of(path: Path, header: Header) -> int:
     """Bytes before the first vertex row. Raises CheckpointError if that is not known from the header."""
-    if header.format == "ascii" or any(element.has_lists for element in header.before(header.vertex)):
-        raise CheckpointError(f"{path}: only a binary PLY is read part by part; save it as one, or adapt it without tiles")
-    return header.body + sum(element.count * element.stride for element in header.before(header.vertex))
+    before = header.before(header.vertex)
+    if header.format == "ascii" or any(element.has_lists for element in before):
+        which = "a binary PLY" if header.format == "ascii" else "a PLY without lists before its splats"
+        raise CheckpointError(f"{path}: only {which} is read part by part; save it as one, or adapt it without tiles")
+    return header.body + sum(element.count * element.stride for element in before)
 
 
 def concatenate(files: Iterable[Path], comments: Iterable[str], out: IO[bytes]) -> int:

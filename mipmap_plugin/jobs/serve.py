@@ -72,7 +72,5 @@ def _run_quietly(job: Job, threads: int | None) -> Outcome:
             return Outcome(job, "interrupted", reason=str(interrupt) or "interrupted", seconds=time.perf_counter() - began)
 
 
-
-
 if __name__ == "__main__":
     main()

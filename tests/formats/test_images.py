@@ -41,8 +41,6 @@ def test_any_color_mode_is_read(tmp_path, mode):
     assert read_image(blank(tmp_path, mode), BLACK).tolist() == torch.zeros(6, 8, 3).tolist()
 
 
-
-
 @pytest.mark.parametrize(("least", "size"), [(None, (40, 56)), (41, (40, 56)), (10, (10, 14)), (11, (20, 28))])
 def test_a_large_jpeg_is_read_smaller_where_few_pixels_do(tmp_path, least, size):
     Image.new("RGB", (56, 40), (200, 100, 50)).save(tmp_path / "a.jpg", quality=95)

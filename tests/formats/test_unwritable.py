@@ -42,8 +42,6 @@ def test_a_folder_that_is_not_there_yet_is_tried_too(tmp_path, monkeypatch):
         refuse_unwritable(tmp_path / "new" / "newer" / "file.json")
 
 
-
-
 @pytest.mark.parametrize(
     "words",
     [

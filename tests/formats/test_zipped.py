@@ -21,8 +21,6 @@ from mipmap_plugin.models import detect, load_model, zipped_folder
 pytestmark = pytest.mark.usefixtures("few_views")
 
 
-
-
 @pytest.fixture
 def ply(tmp_path):
     return tiny.ply(tmp_path / "own.ply").read_bytes()
@@ -96,8 +94,6 @@ def test_a_ply_that_is_no_base_is_told_of_by_the_archives_name(tmp_path, ply):
 @pytest.fixture
 def folder(tmp_path):
     return tiny.folder(tmp_path / "trained" / "model")
-
-
 
 
 @pytest.mark.parametrize("top", ["my model", "", "../../up", "deep/er"])

@@ -205,8 +205,6 @@ def test_what_is_wrong_for_all_is_said_before_any_work(run, tmp_path, monkeypatc
     assert (code, out) == (2, "") and reason in err and err.count("\n") == 1
 
 
-
-
 # Lists
 
 

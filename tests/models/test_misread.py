@@ -81,8 +81,6 @@ def test_a_ply_of_3dgrut_is_read_with_a_note(tmp_path):
     assert not any("3DGRUT" in note for note in load_model(write(tmp_path / "b.ply", {**COLUMNS, **askew})).notes)
 
 
-
-
 ADAM = {"state": {}, "param_groups": [{"params": [0], "name": name} for name in ("xyz", "t", "scaling_t", "rotation_r")]}
 OF_3DGRUT = ("positions", "rotation", "scale", "density", "features_albedo", "features_specular")
 OTHERS = {

@@ -53,8 +53,6 @@ def _usual_signals():
         signal.signal(number, handler)
 
 
-
-
 def test_what_was_unpacked_is_removed(tmp_path):
     packed(tmp_path / "base.zip", tiny.folder(tmp_path / "base"))
     (tmp_path / "unpacked").mkdir()

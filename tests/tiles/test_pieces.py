@@ -186,10 +186,17 @@ def test_strips_give_the_blend_weights_of_their_view(on_disk, monkeypatch):
     assert torch.allclose(painter.weighed(splats, view)[0], whole, atol=0.02, rtol=0.01)  # the frame limits how oblique a splat may be drawn
 
 
-def test_a_plain_text_file_is_refused(tmp_path):
-    path = tmp_path / "text.ply"
-    path.write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n")
-    with pytest.raises(CheckpointError, match="only a binary PLY is read part by part"):
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ("format ascii 1.0\nelement vertex 1", "only a binary PLY is read part by part"),
+        ("format binary_little_endian 1.0\nelement face 1\nproperty list uchar int i\nelement vertex 1", "only a PLY without lists"),
+    ],
+)
+def test_a_file_whose_rows_have_no_known_place_is_refused(tmp_path, header, message):
+    path = tmp_path / "scene.ply"
+    path.write_text(f"ply\n{header}\nproperty float x\nend_header\n0000000\n")
+    with pytest.raises(CheckpointError, match=message):
         PlyRows(path)
 
 

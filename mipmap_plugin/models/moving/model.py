@@ -194,7 +194,7 @@ class MovingModel:
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
         """Check `path` as `save` would. Raises SettingsError, OutputExists, OutputError."""
         if path.suffix.lower() == ".ply" or is_written(path):
-            reason = f"has no room for the network that moves its splats; give a folder, such as {path.with_suffix('')}"
+            reason = "has no room for the network that moves its splats; leave out the ending, and a folder is written"
             raise SettingsError(f"{path}: {'a PLY' if path.suffix.lower() == '.ply' else 'this format'} {reason}")
         self.canonical.refuse_output(path, overwrite=overwrite)
 
