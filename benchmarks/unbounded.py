@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 import tyro
-from rows import write_page, write_rows
+from rows import joined, write_page, write_rows
 from torch import Tensor
 
 from mipmap_plugin import Camera, wrap_model
@@ -140,15 +140,17 @@ def recipes(capture: Capture, scale: float) -> dict[str, dict[str, Any]]:
     return rows
 
 
-def rows_of(name: str, scale: float, data: Path, most: int | None) -> list[Row]:
+def rows_of(name: str, scale: float, data: Path, most: int | None, only: Sequence[str]) -> list[Row]:
+    """`only`: the recipes to measure, and nothing else; none of them: all, and what needs no adapting."""
     capture = CAPTURES[name]
     base = wrap_model(data / "checkpoints" / capture.checkpoint, screen_filter=capture.screen_filter)
     judged, others = split(base, capture)
     judged = evenly(judged, most or len(judged))
     judged_by = judges(base, capture, name, scale, judged, data)
-    rows = [free_rows(base, judge, scale) for judge in judged_by]
+    rows = [[] if only else free_rows(base, judge, scale) for judge in judged_by]
     warm_up(base, scale, others)
-    for recipe, settings in recipes(capture, scale).items():
+    settings_of = {recipe: settings for recipe, settings in recipes(capture, scale).items() if not only or recipe in only}
+    for recipe, settings in settings_of.items():
         adapted = adapt_alone(base, scale, cameras=others or None, **settings)
         assert not views_seen(judged, adapted.adapted_to), f"{name}: views that are judged were adapted to"
         for judge, beside in zip(judged_by, rows, strict=True):
@@ -162,6 +164,7 @@ def main(
     output: Path = Path("benchmarks/results"),
     only: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     scale: tyro.conf.UseAppendAction[tuple[float, ...]] = (),
+    recipe: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     views: int | None = None,
 ) -> None:
     """Measure, and write the tables.
@@ -171,6 +174,7 @@ def main(
         output: Where the results go; those that were measured before are replaced.
         only: Which captures, by name; all by default.
         scale: Which scales; all of a capture by default.
+        recipe: Measure these alone, and keep all other rows.
         views: How many of the held-out views are judged, at most; all by default.
     """
     if unknown := set(only) - CAPTURES.keys():
@@ -179,8 +183,8 @@ def main(
     register_upsampler(LANCZOS["upsampler"], lambda image, size: resize(image, size, "lanczos"), replace=True)
     for name in only or CAPTURES:
         for each in scale or CAPTURES[name].scales:
-            rows = rows_of(name, each, data, views)
-            write_rows(output / "unbounded" / f"{name}_x{each:g}.json", rows)
+            file, rows = output / "unbounded" / f"{name}_x{each:g}.json", rows_of(name, each, data, views, recipe)
+            write_rows(file, joined(file, Row, rows, lambda row: (row.protocol, row.name)) if recipe else rows)
     write_page(output / "unbounded.md", INTRO, output.glob("unbounded/*.json"))
 
 

@@ -29,6 +29,7 @@ class BaseWeights:
         self.count: int | None = None  # of the views that show enough of the splats; None as long as it is not known
         self.size = 1.0  # fraction of their size at which views are weighed: less where a time budget leaves no time for large ones
         self.shown = torch.empty(0, dtype=torch.bool)  # which splats views show (`may_show`)
+        self.whole_of_base = torch.empty(0)  # the base's splats' weights if nothing hid them (`whole_weights`)
         self.notes: list[str] = []  # on what they show
 
     def measured(self, base: SplatModel) -> Tensor:
@@ -51,8 +52,9 @@ class BaseWeights:
             with self._clock.timing("weights", part):
                 weights = weights.lerp(over(further, self.size)[0], part)
         weights = weights * problem.scale**2
-        whole, looked_at = self.whole(gaussians, self.pixel_size(gaussians.means)), evenly(problem.views, self.count)
-        self.shown = may_show(weights, whole, gaussians.means, problem.views, looked_at)
+        self.whole_of_base = self.whole(gaussians, self.pixel_size(gaussians.means))
+        looked_at = evenly(problem.views, self.count)
+        self.shown = may_show(weights, self.whole_of_base, gaussians.means, problem.views, looked_at)
         self.notes += note_on_hidden(self.shown, gaussians.opacities)
         return weights
 

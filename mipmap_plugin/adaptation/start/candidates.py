@@ -83,10 +83,12 @@ class StartSearch:
     def __init__(self, problem: StartProblem, clock: Clock) -> None:
         self._problem, self._clock, self._rounds = problem, clock, Rounds()
         self._least, self._crispness = 0.0, problem.config.crispness  # the fraction of the rows that stay, of a zoom-in how crisp it is
+        self._matching = ROUNDS  # rounds in which opacities are matched
         self._seen = BaseWeights(problem, clock)
         self.notes = self._seen.notes
         self._alike = draws_alike(problem.base_effects, problem.target)
         self._forms = problem.config.closed_form
+        self._learns = takes_steps(problem.config, problem.scale, problem.base_effects, [problem.target])  # whether steps follow
         spreads = problem.target.screen_filter == SURFEL or problem.target.screen_filter in INTEGRATED  # otherwise than by a variance in px²
         suffices = filter_suffices(problem.base_effects, problem.target)
         self._matches_weights = problem.has_blend_weights and not suffices and (problem.scale <= 1 or not spreads)
@@ -110,6 +112,7 @@ class StartSearch:
         if config.merge_to == 1 and config.returns == "last":
             return formed, start_name(self._forms)
         before, (formed, after) = problem.quality(base), self._as_crisp_as_shown(formed, weights)
+        formed, after = self._matched_as_shown(formed, after, weights)
         if self._alike and after.visible < before.visible:  # the filter itself is the better answer, for merged splats too
             self._forms, after = False, before
         bounds = Bounds(self._least_psnr(after), before.visible - problem.may_lose, after.psnr)
@@ -122,8 +125,8 @@ class StartSearch:
     def _as_crisp_as_shown(self, formed: SplatModel, weights: Tensor | None) -> tuple[SplatModel, Quality]:
         """The closed form, or a crisper one where a small zoom-in takes no steps and looks better by that; and its quality."""
         problem, quality = self._problem, self._problem.quality(formed)
-        still = self._forms and not takes_steps(problem.config, problem.scale, problem.base_effects, [problem.target])
-        for crispness in CRISPER if still and 1 < problem.scale < CRISPER_BELOW else ():
+        still = self._forms and not self._learns and 1 < problem.scale < CRISPER_BELOW
+        for crispness in CRISPER if still else ():
             if crispness > (before := self._crispness) and self._clock.allows("candidate"):
                 self._crispness = crispness
                 crisper = self._candidate(weights, 1.0)
@@ -132,6 +135,19 @@ class StartSearch:
                     break
                 formed, quality = crisper, better
         return formed, quality
+
+    def _matched_as_shown(self, formed: SplatModel, quality: Quality, weights: Tensor | None) -> tuple[SplatModel, Quality]:
+        """The closed form, or with opacities matched in as many rounds again if no step follows and it looks better by that; and its quality."""
+        problem, matches = self._problem, self._forms and self._matches_weights and not self._learns
+        if weights is None or not matches or not self._clock.allows("weights", ROUNDS):
+            return formed, quality
+        further, splats = problem.base(), formed.gaussians(problem.views[0]).detach()
+        with problem.phase("closed form"):
+            reshape(further, lambda _: (splats.scales, self._matched(splats, weights, self._seen.whole_of_base, ROUNDS)), problem.views)
+        if (better := problem.quality(further)).visible <= quality.visible:
+            return formed, quality
+        self._matching = 2 * ROUNDS  # of merged splats too
+        return further, better
 
     def _merged_at_once(self, weights: Tensor | None) -> SplatModel | None:
         """The strongest merging, where a time budget is too short for a search and this is no worse than the base; else None."""
@@ -233,19 +249,25 @@ class StartSearch:
         scales, opacities = closed_form(gaussians, problem.views, problem.scale, problem.base_effects, problem.target, settings)
         if weights is None or not rounds:
             return scales, opacities
+        formed = replace(gaussians, scales=scales, opacities=opacities)
+        return scales, self._matched(formed, weights, self._seen.whole(gaussians, pixel), rounds)
+
+    def _matched(self, splats: Gaussians, weights: Tensor, whole: Tensor, rounds: int) -> Tensor:
+        """The opacities [N] of splats in closed form, for these blend weights [N]; `whole` [N]: those of the base if nothing hid it."""
+        problem = self._problem
         size = min(self._seen.size, problem.scale)  # a zoom-in is weighed in images of the base's size: sums over pixels need no finer ones
         finer = problem.scale / size
         target = replace(problem.target, eps2d=problem.target.eps2d / finer**2, settings=problem.target.settings.finer(1 / finer))
         views = [view.zoomed(size) for view in evenly(problem.views, self._seen.count)]
 
         def weights_of(opacities: Tensor) -> Tensor:
-            return blend_weights(replace(gaussians, scales=scales, opacities=opacities), views, problem.backend, target) * finer**2
+            return blend_weights(replace(splats, opacities=opacities), views, problem.backend, target) * finer**2
 
-        return scales, matched_opacities(opacities, weights, self._seen.whole(gaussians, pixel), weights_of, rounds)
+        return matched_opacities(splats.opacities, weights, whole, weights_of, rounds)
 
     def _matching_rounds(self, weights: Tensor | None) -> int:
         """How many rounds opacities are matched in: none without blend weights, and no more than there is time for."""
-        rounds = wanted = ROUNDS if self._matches_weights and weights is not None else 0
+        rounds = wanted = self._matching if self._matches_weights and weights is not None else 0
         while rounds and not self._clock.allows("weights", rounds):
             rounds -= 1
         if rounds == 0 < wanted and UNMATCHED not in self.notes:

@@ -6,6 +6,7 @@ import pytest
 import tiny
 import torch
 
+from mipmap_plugin.adaptation.start import candidates
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.candidates import UNMATCHED
 from mipmap_plugin.adaptation.start.clock import Clock
@@ -59,6 +60,12 @@ def test_no_opacity_rises_above_one():
     assert (new == 1).all()
 
 
+def test_an_opacity_that_overshot_goes_half_of_the_way_back():
+    """Of a weight that is the square of the opacity: a ratio of 4 leads from 0.25 to 1, a ratio of 1/4 from there to 0.5, which is right."""
+    new = matched_opacities(torch.tensor([0.25]), torch.tensor([0.25]), NOTHING[:1], lambda opacities: opacities**2, rounds=2)
+    assert new.item() == pytest.approx(0.5, rel=1e-2)
+
+
 def test_unseen_splats_stay_as_they_are():
     opacities = torch.tensor([0.3, 0.0])
     assert torch.equal(matched_opacities(opacities, torch.zeros(2), NOTHING, torch.zeros_like), opacities)
@@ -80,6 +87,27 @@ def test_what_hardly_shows_of_a_splat_says_little_of_its_opacity():
     opacities, whole = torch.tensor([0.3]), torch.tensor([1000.0])
     new = matched_opacities(opacities, torch.tensor([0.2]), whole, lambda tried: torch.tensor([0.1]))
     assert new.item() == pytest.approx(0.3 * (1.2 / 1.1) ** ROUNDS, rel=1e-3)
+
+
+@pytest.mark.parametrize("factors", [(1.0, 0.2), (0.2, 5.0)], ids=["keeps the first", "keeps the second"])
+def test_without_steps_opacities_are_matched_once_more_and_kept_if_that_looks_better(monkeypatch, factors):
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
+    right = opacities_by(monkeypatch, base, [1.0, 1.0])
+    torch.testing.assert_close(opacities_by(monkeypatch, base, factors), right)
+
+
+def test_before_steps_opacities_are_matched_once(monkeypatch):
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
+    with pytest.raises(StopIteration):
+        opacities_by(monkeypatch, base, [1.0])
+    opacities_by(monkeypatch, base, [1.0], steps=1)
+
+
+def opacities_by(monkeypatch, base, factors, **settings):
+    """Opacities [N] at x1/4, where each matching multiplies them by the next of these factors; StopIteration if there are too few."""
+    left = iter(factors)
+    monkeypatch.setattr(candidates, "matched_opacities", lambda opacities, *_: opacities * next(left))
+    return base.adapt(1 / 4, recipe="instant", merge_to=1.0, **settings).model.gaussians(tiny.cameras()[0]).opacities.detach()
 
 
 @pytest.mark.filterwarnings("ignore:the time budget")

@@ -67,7 +67,7 @@ def test_steps_that_were_taken_back_are_marked():
     adapted = model.adapt(SCALE, **HARMFUL)
     assert [(point.step, point.taken_back) for point in adapted.report.curve] == [(0, False), (2, True), (4, True), (6, True)]
     assert len({point.validation_db for point in adapted.report.curve}) == 1  # what the run went on with each time
-    assert same(adapted.model, model.adapt(SCALE, **{**HARMFUL, "steps": 0}).model)
+    assert same(adapted.model, model.adapt(SCALE, **{**HARMFUL, "rates": dict.fromkeys(BOLD, 0.0)}).model)
 
 
 def test_a_run_goes_on_gently_after_harm():
