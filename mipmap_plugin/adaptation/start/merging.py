@@ -20,9 +20,9 @@ from mipmap_plugin.adaptation.parallel import CHUNK, in_chunks
 from mipmap_plugin.backends.cpu import nearest_along
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.process import threads
-from mipmap_plugin.splatting.eigen import eigh3
+from mipmap_plugin.splatting.eigen import quats_and_scales
 from mipmap_plugin.splatting.harmonics import C0
-from mipmap_plugin.splatting.rotations import quaternions, rotations
+from mipmap_plugin.splatting.rotations import rotations
 
 # Target pixels: a difference from black to white in one channel counts as this distance.
 CONTRAST = 20.0
@@ -212,10 +212,9 @@ class _Moments:
 
     def _shapes(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Quaternions [n, 4], scales [n, 3] and opacities [n] of some rows."""
-        variances, directions = eigh3(self.covariances[rows])
-        directions = directions * torch.linalg.det(directions).sign()[:, None, None]  # rotations, not reflections
-        opacities = -torch.expm1(-self.depth[rows] / _surface(self.covariances[rows]))
-        return quaternions(directions), variances.clamp_min(0).sqrt(), opacities.clamp_max(MAX_OPACITY)
+        covariances = self.covariances[rows]
+        opacities = -torch.expm1(-self.depth[rows] / _surface(covariances))
+        return *quats_and_scales(covariances), opacities.clamp_max(MAX_OPACITY)
 
     def _mean_harmonics(self, old: Tensor, rows: Tensor, old_weights: Tensor) -> Tensor:
         """The harmonics [N, K, 3] of merged splats, from the `old` ones [N0, K, 3]: each thread sums some of the coefficients."""
