@@ -7,7 +7,6 @@ import threading
 import numpy as np
 import pressing
 import pytest
-import tiny
 import torch
 from brief_runs import BRIEF, shown, wrapped
 
@@ -175,13 +174,6 @@ def test_the_knee_ends_the_run():
 @pytest.mark.parametrize("answer", [True, np.float64(1) < 2, torch.ones(()) < 2])
 def test_an_observer_ends_a_run_by_true_of_any_library(answer):
     assert wrapped().adapt(1 / 4, **BRIEF, observe=lambda step, *_: step == 2 and answer).report.ended_by == "its observer"
-
-
-def test_an_observer_sees_images_without_gradients():
-    seen, view = [], tiny.cameras(1)[0].zoomed(1 / 4)
-    wrapped().adapt(1 / 4, **BRIEF, observe=lambda step, seconds, render: seen.append(render(view)))
-    assert len(seen) == 8 and not any(image.requires_grad for image in seen)
-    assert seen[0].numpy().shape == (*view.size, 3) and not torch.equal(seen[0], seen[-1])
 
 
 @pytest.mark.parametrize("answer", [None, 1, "yes", torch.ones(2, 2), [True]])

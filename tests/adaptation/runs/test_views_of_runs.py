@@ -20,14 +20,6 @@ def test_a_bare_file_without_cameras_adapts_on_an_orbit(tmp_path):
     assert is_finite(adapted.model)
 
 
-@pytest.mark.parametrize("cameras", ["cameras.json", [3], 7])
-def test_what_are_no_cameras_is_refused(cameras):
-    with pytest.raises(SettingsError, match=r"cameras must be of the type mipmap_plugin.Camera"):
-        wrap_model(tiny.model(), cameras=tiny.cameras(2)).adapt(0.5, cameras=cameras, steps=0)
-    with pytest.raises(SettingsError, match=r"cameras must be of the type mipmap_plugin.Camera"):
-        wrap_model(tiny.model(), cameras=[cameras])
-
-
 def test_a_scene_of_which_most_is_before_the_near_plane_is_told_of():
     """What is left is adapted all the same."""
     base = wrap_model(tiny.model(), cameras=tiny.cameras())
