@@ -7,8 +7,6 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.curve import progress
-from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.wrap import wrap_model
 
 pytestmark = pytest.mark.usefixtures("few_views")
@@ -72,10 +70,3 @@ def test_at_scale_one_there_is_nothing_to_do(recipe):
 def test_at_scale_one_a_base_of_another_filter_becomes_classic_where_that_is_asked_for():
     adapted = wrapped(screen_filter="antialiased").adapt(1, viewer="classic", steps=2, extra_views=0)
     assert adapted.report.ended_by == "2 steps" and adapted.effects.screen_filter == "classic"
-
-
-def test_rates_decay_by_the_steps_or_by_the_budget_whichever_is_used_up_first():
-    config = AdaptConfig(steps=100, time_budget_s=60.0)
-    assert [progress(*used, config) for used in ((0, 0.0), (50, 15.0), (10, 45.0), (100, 10.0), (5, 90.0))] == [0, 0.5, 0.75, 1, 1]
-    assert progress(25, 1e6, AdaptConfig(steps=100)) == 0.25
-    assert progress(0, 40.0, config, before=40.0) == 0 and progress(0, 50.0, config, before=40.0) == 0.5
