@@ -181,7 +181,7 @@ def all_rows(model: Wrapped, judge: Evaluator, scales: Sequence[float], recipes:
     for name, scale in product(recipes, scales):
         config_of(name, scale, settings)
     model.refuse_undrawn([view.camera for view in judge.views], min(scales))
-    if doubt := of_another_scene(model, judge.views, scales[0], judge.protocol):
+    if doubt := of_another_scene(model, judge.views):
         warn(doubt)
     for scale in scales:
         rows += training_free_rows(model, judge, scale, settings.get("upsampler", "bicubic"), viewer=viewer)
