@@ -52,20 +52,17 @@ class Recorder:
         self._reports: list[tuple[str, dict[str, Any]]] = []
 
     def shot(self, shot: Shot) -> None:
-        """Keep a row's first view."""
         images = {"image": packed(shot.image.cpu()), "truth": packed(shot.truth.cpu())}
         self._shots.append({name: getattr(shot, name) for name in SHOT_FACTS} | images)
         if self._other:
             self._other.shot(shot)
 
     def adapted(self, row: str, adapted: Adapted) -> None:
-        """Keep a report."""
         self._reports.append((row, adapted.report.model_dump(mode="json")))
         if self._other:
             self._other.adapted(row, adapted)
 
     def restored(self, row: str, report: dict[str, Any]) -> None:
-        """Tell the other watcher."""
         if self._other:
             self._other.restored(row, report)
 

@@ -21,10 +21,6 @@ def test_every_built_in_recipe_fits_every_scale():
         assert {recipe(name, scale).recipe for scale in (1 / 16, 1 / 4, 1, 4)} == {name}
 
 
-def test_a_time_budget_begins_as_crisp_as_without():
-    assert recipe("default", 2, time_budget_s=3.0).crispness == recipe("default", 2).crispness
-
-
 def test_what_is_no_recipe_is_named():
     register_recipe("mine", 3)
     with pytest.raises(PluginError, match="recipe 'mine' is of type int"):

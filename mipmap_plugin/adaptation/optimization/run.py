@@ -55,7 +55,6 @@ class Task:
 
     @cached_property
     def cameras(self) -> Mapping[Camera, Camera]:
-        """The camera of the new scale of each view."""
         return {view: view.zoomed(self.scale) for view in self.views}
 
     def images(self, gaussians: Gaussians, cameras: Sequence[Camera], draw: int) -> list[Tensor]:

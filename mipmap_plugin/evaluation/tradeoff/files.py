@@ -45,8 +45,6 @@ def _facts_of(each: Tradeoff) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Folder:
-    """The folder that a tradeoff is written to."""
-
     path: Path
     picture: bool  # whether to write the plot
     overwrite: bool
