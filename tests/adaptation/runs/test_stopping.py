@@ -165,10 +165,11 @@ def test_steps_that_were_planned_for_a_time_budget_are_told(monkeypatch):
     assert report.ended_by == "1 step (planned for the time budget in place of 7)" and report.settings.steps == 7
 
 
-def test_the_knee_ends_the_run():
-    report = wrapped().adapt(1 / 4, **{**BRIEF, "steps": 50, "check_every": 1, "patience": 2, "min_gain_db": 1000}).report
-    assert report.ended_by == "knee: 2 checks in a row gained less than 1000 dB"
-    assert report.curve[-1].step == 3
+@pytest.mark.parametrize(("patience", "told"), [(1, "1 check"), (2, "2 checks")])
+def test_the_knee_ends_the_run(patience, told):
+    report = wrapped().adapt(1 / 4, **{**BRIEF, "steps": 50, "check_every": 1, "patience": patience, "min_gain_db": 1000}).report
+    assert report.ended_by == f"knee: {told} in a row gained less than 1000 dB"
+    assert report.curve[-1].step == patience + 1
 
 
 @pytest.mark.parametrize("answer", [True, np.float64(1) < 2, torch.ones(()) < 2])
