@@ -38,10 +38,6 @@ def test_what_a_start_was_searched_with_is_gone_during_the_steps(monkeypatch):
     assert found and left and not any(left)
 
 
-def test_the_closed_form_is_where_a_run_starts():
-    assert start_of(adapted().report) == "the closed form"
-
-
 @pytest.mark.parametrize(("psnr", "told"), [(30.0, "holds the base as it is, for nothing was better: 30.00 dB"), (31.0, "30.00 -> 31.00 dB")])
 def test_a_start_with_which_nothing_was_done_to_the_base_is_told_as_the_base(psnr, told):
     report = Report.model_construct(returned=UNCHANGED, validation={AS_IT_IS: 30.0, UNCHANGED: psnr})
