@@ -119,12 +119,7 @@ class FrozenBase:
 
     @in_usual_modes
     def render(
-        self,
-        camera: Camera,
-        scale: float = 1.0,
-        screen_filter: str | None = None,
-        supersampling: int = 1,
-        **options: Unpack[RenderOptions],
+        self, camera: Camera, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1, **options: Unpack[RenderOptions]
     ) -> Rendered:
         """Render the base model's view of `camera`, which samples `scale` times as finely as the training did.
 

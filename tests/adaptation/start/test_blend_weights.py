@@ -86,9 +86,7 @@ def test_what_lies_behind_the_camera_has_none():
 
 
 @pytest.mark.parametrize(
-    "effects",
-    [Effects(0), Effects(0, "analytic"), Effects(0, settings=replace(USUAL, min_variance=1.0))],
-    ids=["classic", "analytic", "culled"],
+    "effects", [Effects(0), Effects(0, "analytic"), Effects(0, settings=replace(USUAL, min_variance=1.0))], ids=["classic", "analytic", "culled"]
 )
 def test_one_pass_finds_the_same_weights_as_gradients(effects):
     pytest.importorskip("numba")

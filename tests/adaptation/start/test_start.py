@@ -78,9 +78,7 @@ def test_crispness_reaches_the_start():
 
 
 @pytest.mark.parametrize(
-    ("scale", "tried"),
-    [(1.05, [0.5, 1.0]), (2, [0.5]), (1 / 2, [0.0])],
-    ids=["a small zoom-in", "one that does not tell", "a zoom-out"],
+    ("scale", "tried"), [(1.05, [0.5, 1.0]), (2, [0.5]), (1 / 2, [0.0])], ids=["a small zoom-in", "one that does not tell", "a zoom-out"]
 )
 def test_a_start_without_steps_is_as_crisp_as_views_show(scale, tried, monkeypatch):
     """At x1.05 thin wires were up to 0.5 dB worse than in the base."""
