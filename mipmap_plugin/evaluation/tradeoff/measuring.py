@@ -100,6 +100,7 @@ class _Measurement:
         if backend not in self._warm:
             warm_up(model, scale, truth.adapt_on)
             self._warm.add(backend)
+        cameras = [replace(view, split="train") for view in truth.adapt_on] or None  # however the checkpoint marks them
         measured: dict[int, list[tuple[float, float]]] = {}  # by step: seconds and dB of each repeat that took as many steps
 
         @torch.no_grad()
@@ -113,7 +114,7 @@ class _Measurement:
         ends = list[Point]()
         for repeat in range(plan.repeats):
             settings: dict[str, Any] = {"seed": plan.seed + repeat} | ({} if steps is None else {"steps": steps})
-            adapted = adapt_alone(model, scale, recipe=recipe, viewer=plan.viewer, cameras=truth.adapt_on or None, observe=observe, **settings)
+            adapted = adapt_alone(model, scale, recipe=recipe, viewer=plan.viewer, cameras=cameras, observe=observe, **settings)
             first, report = first or adapted, adapted.report
             spent = Spread.of([report.seconds["total"]])
             end = Point(scale, "adapted", title, adapted.backend.name, report.gaussians_after, adapt_seconds=spent, ended_by=report.ended_by)
