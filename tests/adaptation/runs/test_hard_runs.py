@@ -124,7 +124,7 @@ def test_a_scale_is_a_number_of_any_type(scale):
         (dict(resume=5), r"resume must be a text such as 'output/bicycle', or a pathlib.Path, got int"),
         (dict(observe=5), "observe must be a Callable, got int"),
         (dict(views="some"), "^setting views: must be 'given', 'train', 'test', 'orbit' or 'jittered', got 'some'$"),
-        (dict(views="test"), "there are no test views among the 4 cameras; use the view policy 'given'"),
+        (dict(views="test"), "there are no test views among the 4 cameras; give cameras that have some, or use the view policy 'given'"),
         (dict(resize="box", scale=0.3, steps=1), "is not a whole multiple of"),
     ],
 )
