@@ -10,8 +10,8 @@ from typing import Any
 from PIL import Image, ImageDraw
 from torch import Tensor
 
+from mipmap_plugin.adaptation.plot import figure_class
 from mipmap_plugin.evaluation.report import markdown
-from mipmap_plugin.evaluation.tradeoff.plot import figure_class
 from mipmap_plugin.formats.atomic import new_file
 
 INTRO = """# A dolly over a ladder of levels

@@ -16,12 +16,12 @@ from pathlib import Path
 import torch
 from numerics_usual import UsualFormulas, gsplat_compensation_slope, mip_compensation, published_gradient_share, unnormalized_axes
 
+from mipmap_plugin.adaptation.plot import figure_class
 from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.conformance.cases import HardCase, crowd, far_from_the_origin, odd_row, view
 from mipmap_plugin.backends.conformance.checks import Answer, draw
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.evaluation.tradeoff.plot import figure_class
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.splatting.filters import LEAST_COMPENSATION, footprint

@@ -7,9 +7,9 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from mipmap_plugin.adaptation.plot import figure_class
 from mipmap_plugin.evaluation.evaluate import Row
 from mipmap_plugin.evaluation.measure import BASE
-from mipmap_plugin.evaluation.tradeoff.plot import figure_class
 
 # What a row's name has before its crispness.
 BY_CRISPNESS = ", crispness "

@@ -192,15 +192,14 @@ def _view_dependent_color(degree: int, gaussians: Gaussians, base_degree: int) -
 
 
 def _adaptation_effects(config: AdaptConfig | None, scale: float) -> list[Effect]:
-    upsampling, statistics = "an enlarged image for each view", "two sums and a norm per splat, for each view of each step"
-    if config is None or not config.steps:
-        reason = "nothing is optimized"
-        return [Effect("upsampler", False, reason, upsampling), Effect("densification statistics", False, reason, statistics)]
-    threshold = config.densify_gradient
-    reason = "no splats are cloned or split" if threshold is None else f"splats with gradients above {threshold:g} are cloned or split"
+    upsampling = statistics = False, "nothing is optimized"
+    if config is not None and config.steps:
+        threshold = config.densify_gradient
+        reason = "no splats are cloned or split" if threshold is None else f"splats with gradients above {threshold:g} are cloned or split"
+        upsampling, statistics = _upsampler(config, scale), (threshold is not None, reason)
     return [
-        Effect("upsampler", *_upsampler(config, scale), upsampling),
-        Effect("densification statistics", threshold is not None, reason, statistics),
+        Effect("upsampler", *upsampling, "an enlarged image for each view"),
+        Effect("densification statistics", *statistics, "two sums and a norm per splat, for each view of each step"),
     ]
 
 

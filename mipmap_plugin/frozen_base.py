@@ -89,20 +89,19 @@ class FrozenBase:
         trained to look right with dilation. Raises SettingsError for an unknown viewer or filter, and for a viewer together with a filter.
         """
         check_kinds(screen_filter=(screen_filter, str))
-        trained, degree = self.trained, self._needs.sh_degree
+        trained = self.trained
+        own = Effects(self._needs.sh_degree, trained.screen_filter, trained.eps2d, self.background, supersampling, trained.near_plane)
         if viewer is not None:
             if screen_filter is not None:
                 raise SettingsError(f"viewer {viewer} has a screen filter of its own; leave the screen filter {screen_filter} out")
-            plain = Effects(degree, background=self.background, supersampling=supersampling, near_plane=trained.near_plane)
-            return find_viewer(viewer).effects(plain)
+            return find_viewer(viewer).effects(own)
+        scaled = replace(own, eps2d=trained.eps2d * scale**2)
         if screen_filter in (None, "scaled"):
-            eps2d = trained.eps2d * (scale**2 if screen_filter == "scaled" else 1)
-            return Effects(degree, trained.screen_filter, eps2d, self.background, supersampling, trained.near_plane)
+            return own if screen_filter is None else scaled
         check_screen_filter(screen_filter, "scaled", trained.screen_filter)
-        eps2d = USUAL_EPS2D.get(screen_filter, DILATION)
         if screen_filter in INTEGRALS and trained.screen_filter == "classic":
-            eps2d = trained.eps2d * scale**2
-        return Effects(degree, screen_filter, eps2d, self.background, supersampling, trained.near_plane)
+            return replace(scaled, screen_filter=screen_filter)
+        return replace(own, screen_filter=screen_filter, eps2d=USUAL_EPS2D.get(screen_filter, DILATION))
 
     def backend(self, *, gradients: bool = False, screen_filter: str | None = None, viewer: str | None = None) -> tuple[Backend, str]:
         """Return the backend that renders this model, and why it was chosen."""
@@ -120,12 +119,7 @@ class FrozenBase:
 
     @in_usual_modes
     def render(
-        self,
-        camera: Camera,
-        scale: float = 1.0,
-        screen_filter: str | None = None,
-        supersampling: int = 1,
-        **options: Unpack[RenderOptions],
+        self, camera: Camera, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1, **options: Unpack[RenderOptions]
     ) -> Rendered:
         """Render the base model's view of `camera`, which samples `scale` times as finely as the training did.
 

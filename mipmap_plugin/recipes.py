@@ -125,8 +125,8 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
     if overrides.get("steps") is not None:
         settings.pop("most_steps", None)
     config = AdaptConfig(**(settings | overrides))
-    if config.band != (1, 1) and scale * config.band[1] > HIGHEST:
-        raise SettingsError(f"band: x{scale:g} would be shown up to x{scale * config.band[1]:g}, but a band ends at the base's scale, x1")
+    if config.band != (1, 1) and (highest := scale * max(1.0, config.band[1])) > HIGHEST:
+        raise SettingsError(f"band: x{scale:g} would be shown up to x{highest:g}, but a band ends at the base's scale, x1")
     return config
 
 

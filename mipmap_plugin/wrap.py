@@ -49,7 +49,7 @@ class WrapOptions(TypedDict, total=False):
 class Wrapped(FrozenBase):
     """A frozen base model with its cameras, ready to be adapted to any scale and made into levels. It never changes."""
 
-    doubted = False  # whether a warning told that the photographs of its cameras show something else
+    doubted = False  # whether a warning told that the photographs show something else
 
     @in_usual_modes
     def levels(self, viewer: str, *, resume: str | Path | None = None, **options: Any) -> Ladder:

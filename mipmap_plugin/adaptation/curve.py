@@ -7,7 +7,6 @@ import math
 import torch
 from pydantic import BaseModel, ConfigDict
 
-from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.process.clock import now
 
 
@@ -53,12 +52,6 @@ class Stopwatch:
     def read(self) -> float:
         """Return the seconds so far, also inside `with`."""
         return self.seconds if self._start is None else self.seconds + now(self._device) - self._start
-
-
-def progress(step: int, seconds: float, config: AdaptConfig, before: float = 0.0) -> float:
-    """Fraction (0..1) of its steps that a run has taken, or of its time budget but for the seconds `before` its first step, whichever is larger."""
-    left = math.inf if config.time_budget_s is None else max(config.time_budget_s - before, 1e-9)
-    return min(1.0, max(step / max(1, config.steps), (seconds - before) / left))
 
 
 def decibel(mean_square: float) -> float:

@@ -63,9 +63,7 @@ def psnr_per_viewer(validation: Validation, backend: Backend, targets: Mapping[s
     return dict(zip(targets, psnrs, strict=True))
 
 
-def psnr_as_trained(
-    validation: Validation, backend: Backend, targets: Mapping[str, Effects], base: SplatModel, effects: Effects
-) -> float | None:
+def psnr_as_trained(validation: Validation, backend: Backend, targets: Mapping[str, Effects], base: SplatModel, effects: Effects) -> float | None:
     """PSNR (dB) of the base on the same views as its training draws it (`effects`).
 
     None at x1, where that is the truth itself, and where the file is drawn so too, so that this is the base as it is.

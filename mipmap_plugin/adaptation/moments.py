@@ -34,9 +34,7 @@ def at_moments(views: Sequence[Camera], most: int | None) -> list[Camera]:
     return [replace(view, time=nearest[view.time or 0.0]) for view in views]
 
 
-def at_their_moments(
-    views: Sequence[Camera], validation: Sequence[Camera], most: int | None, seed: int
-) -> tuple[list[Camera], list[Camera], str]:
+def at_their_moments(views: Sequence[Camera], validation: Sequence[Camera], most: int | None, seed: int) -> tuple[list[Camera], list[Camera], str]:
     """The views and the validation views, of which every second one steers, with their times, at `most` moments or fewer, and a note on these.
 
     The other validation views, which choose among the states at the end, have moments of their own, since they are held out.

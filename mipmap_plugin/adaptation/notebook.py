@@ -49,7 +49,6 @@ def adapted_facts(model: SplatModel, report: Report) -> dict[str, str]:
 
 
 def line(kind: str, facts: Mapping[str, str]) -> str:
-    """The facts in a line."""
     return f"<{kind}: {', '.join(f'{name} {value}' for name, value in facts.items())}>"
 
 

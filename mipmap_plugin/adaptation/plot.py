@@ -9,14 +9,19 @@ from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.errors import SettingsError, install
 
 
-def plot(report: Report) -> Any:
-    """dB over the seconds of adapting, as a matplotlib Figure that a notebook shows. Raises SettingsError without matplotlib."""
+def figure_class(otherwise: str = "") -> Any:
+    """matplotlib's Figure class, which needs no screen. Raises SettingsError without matplotlib; `otherwise`: what else can be done then."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise SettingsError(f"plots need matplotlib; {install('plot')}") from error
+        raise SettingsError(f"plots need matplotlib; {install('plot')}{otherwise}") from error
+    return Figure
 
-    class Shown(Figure):  # type: ignore[misc, unused-ignore]  # without matplotlib it has no types
+
+def plot(report: Report) -> Any:
+    """dB over the seconds of adapting, as a matplotlib Figure that a notebook shows. Raises SettingsError without matplotlib."""
+
+    class Shown(figure_class()):  # type: ignore[misc]  # it has no types without matplotlib
         """A figure that a notebook shows without pyplot."""
 
         def _repr_png_(self) -> bytes:

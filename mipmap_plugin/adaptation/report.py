@@ -182,7 +182,6 @@ def option_note(base: SplatModel, scale: float) -> str:
 
 
 def versions() -> dict[str, str]:
-    """The versions of this package and of torch."""
     try:
         own = version("mipmap-plugin")
     except PackageNotFoundError:  # run from a source tree that was not installed

@@ -31,7 +31,6 @@ class ViewSchedule:
 
     @property
     def view_count(self) -> int:
-        """The number of views."""
         return len(self._rounds.views)
 
     def __call__(self, step: int, progress: float) -> list[Camera]:

@@ -45,8 +45,7 @@ SCALE_UP = "scale the scene up, with its cameras if it has any"
 
 # What is said where there are no cameras: with those of an object all is well, but those of a capture are a guess, which may cost 10 dB and more.
 ORBITED = (
-    "no cameras are known: views of a generated orbit are adapted to, {told}, and all dB are of such{seems}; "
-    "give the scene's cameras (--cameras)"
+    "no cameras are known: views of a generated orbit are adapted to, {told}, and all dB are of such{seems}; give the scene's cameras (--cameras)"
 )
 CAPTURE = "; this seems to be a capture, and from where it was photographed is a guess: seen from there it may look worse than its base"
 VIEWED = ", or adapt for what you look at (mipmap-plugin view)"

@@ -50,7 +50,8 @@ def choose_views(cameras: Sequence[Camera], viewpoints: Viewpoints, config: Adap
     split = "test" if config.views == "test" else "train"
     views = [camera for camera in cameras if camera.split == split]
     if not views:
-        raise SettingsError(f"there are no {split} views among the {plural(len(cameras), 'camera')}; use the view policy 'given'")
+        none = f"there are no {split} views among the {plural(len(cameras), 'camera')}"
+        raise SettingsError(f"{none}; give cameras that have some, or use the view policy 'given'")
     if config.views == "jittered":
         extra = jittered(with_company(views, viewpoints.orbit), config.extra_views, generator)
         return views + extra, f"{plural(len(views), 'train view')} and {len(extra)} around {'it' if len(views) == 1 else 'them'}"

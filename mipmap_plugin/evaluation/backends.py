@@ -54,7 +54,6 @@ def check(name: str, *, full: bool = False) -> list[Outcome]:
 
 
 def listing_table(rows: Sequence[BackendStatus]) -> str:
-    """A Markdown table of backends."""
     body = [[row.name, row.device, f"no: {'; '.join(row.reasons)}" if row.reasons else "yes", row.note] for row in rows]
     return markdown(["backend", "device", "adapts 3DGS?", "note"], body)
 

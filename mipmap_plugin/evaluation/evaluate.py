@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from mipmap_plugin.adaptation.adapted import Adapted
+from mipmap_plugin.adaptation.target.disk_cache import fingerprint
 from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError, some_of, unknown, warn
@@ -31,7 +32,6 @@ from mipmap_plugin.evaluation.measure import (
 from mipmap_plugin.evaluation.metrics import psnr, ssim
 from mipmap_plugin.evaluation.other_scene import of_another_scene, of_another_size
 from mipmap_plugin.evaluation.perceptual import Perceptual
-from mipmap_plugin.evaluation.photographs import digest_of_image
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView
 from mipmap_plugin.evaluation.shots import Recorder, Shot, Watcher
 from mipmap_plugin.progress import Bar
@@ -79,7 +79,7 @@ class Evaluator:
     def cell(self, key: dict[str, Any], measure: Callable[[Evaluator], Row]) -> Row:
         """The row `key`: measured by an evaluator like this one, or kept from before an interruption, if the truth was the same then."""
         recorder = Recorder(self.watcher)
-        key = {**key, "truth": digest_of_image(self.views[0].truth(key["scale"], self.protocol))}
+        key = {**key, "truth": fingerprint(self.views[0].truth(key["scale"], self.protocol))}
         known = self.cells.find(key)
         if known is None:
             row = measure(replace(self, watcher=recorder))
@@ -122,12 +122,11 @@ def training_free_rows(
     """
     found = baselines(model, scale, judge.protocol.shrink_by, filters=filters, upsampler=upsampler)
     in_viewers = [base_in_viewer(name, model, scale) for name in viewers_for(viewer)] if viewer else []
-
     network = network_input(upsampler)
 
-    def row(baseline: Baseline) -> Row:
-        name, render, count = baseline.name, baseline.render, baseline.gaussians
-        return judge.cell({"row": name, "scale": scale} | network, lambda judge: judge.row(name, scale, render, gaussians=count))
+    def row(each: Baseline) -> Row:
+        key = {"row": each.name, "scale": scale} | network
+        return judge.cell(key, lambda judge: judge.row(each.name, scale, each.render, gaussians=each.gaussians))
 
     return [row(baseline) for baseline in found] + worst([row(baseline) for baseline in in_viewers])
 
@@ -182,7 +181,7 @@ def all_rows(model: Wrapped, judge: Evaluator, scales: Sequence[float], recipes:
     for name, scale in product(recipes, scales):
         config_of(name, scale, settings)
     model.refuse_undrawn([view.camera for view in judge.views], min(scales))
-    if doubt := of_another_scene(model, judge.views, scales[0], judge.protocol):
+    if doubt := of_another_scene(model, judge.views):
         warn(doubt)
     for scale in scales:
         rows += training_free_rows(model, judge, scale, settings.get("upsampler", "bicubic"), viewer=viewer)

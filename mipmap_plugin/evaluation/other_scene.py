@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from mipmap_plugin.adaptation.target.other_world import doubt_about
 from mipmap_plugin.adaptation.target.photographs import names_of
 from mipmap_plugin.evaluation.judged import JudgedView
-from mipmap_plugin.evaluation.protocols import Protocol, TruthView
+from mipmap_plugin.evaluation.protocols import TruthView
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.scenes.training_options import photographs_folder, trained_size
@@ -17,17 +17,17 @@ from mipmap_plugin.wrap import Wrapped
 ROUNDING = 4
 
 
-def of_another_scene(model: Wrapped, views: Sequence[TruthView], scale: float, protocol: Protocol) -> str:
+def of_another_scene(model: Wrapped, views: Sequence[TruthView]) -> str:
     """That the base does not show what the photographs do, in a sentence (`doubt_about`).
 
-    "" if it does, or if that was told of all photographs of its cameras already.
+    Whatever scale they are judged at: pictures of a few pixels are like each other whatever they show. "" if it does, or if that was told already.
     """
     if model.doubted:
         return ""
-    truths = {view.camera: view for view in views}
-    masks = ", whose transparent parts count as background" if any(isinstance(view, JudgedView) and view.transparent for view in views) else ""
+    judged = {view.camera: view for view in views if isinstance(view, JudgedView)}
+    masks = ", whose transparent parts count as background" if any(view.transparent for view in judged.values()) else ""
     option, exposures = f"--images{masks}", model.model.traits.exposures
-    return doubt_about([*truths], lambda camera: truths[camera].truth(scale, protocol), model.render, model.background, option, exposures)
+    return doubt_about([*judged], lambda camera: judged[camera].photograph, model.render, model.background, option, exposures)
 
 
 def of_another_size(model: Wrapped, scene: Scene) -> str:

@@ -21,10 +21,7 @@ Kind = Literal["alex", "vgg", "vgg-01"]
 INSTALL = install("metrics")
 
 # torchvision's weights for ImageNet, at torchvision's own addresses.
-DOWNLOADS = {
-    "alex": "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
-    "vgg": "https://download.pytorch.org/models/vgg16-397923af.pth",
-}
+DOWNLOADS = {"alex": "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth", "vgg": "https://download.pytorch.org/models/vgg16-397923af.pth"}
 
 AGAIN = "remove it, so that it is downloaded again"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -30,11 +29,6 @@ def kept_photographs(
         most_bytes -= kept.nbytes * fits
         found.append(partial(unpacked, kept) if fits else partial(scene.image, camera, background))
     return found
-
-
-def digest_of_image(image: Tensor) -> str:
-    """A hash of an image, hexadecimal."""
-    return hashlib.sha256(image.cpu().numpy().tobytes()).hexdigest()
 
 
 def packed(image: Tensor) -> Tensor:

@@ -30,7 +30,6 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def published_table(rows: Sequence[Published]) -> str:
-    """A Markdown table of published results."""
     head = ["scale", "protocol", "published", "PSNR dB", "SSIM", LPIPS_LABEL, "source"]
     body = [
         [f"x{row.scale:g}", row.protocol, row.method, f"{row.psnr_db:.2f}", _digits(row.ssim, 3), _digits(row.lpips, 3), row.source] for row in rows
@@ -51,5 +50,4 @@ def markdown(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
 
 
 def records(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Rows as dictionaries, for JSON."""
     return [asdict(row) for row in rows]

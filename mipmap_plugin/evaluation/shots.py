@@ -52,31 +52,29 @@ class Recorder:
         self._reports: list[tuple[str, dict[str, Any]]] = []
 
     def shot(self, shot: Shot) -> None:
-        """Keep a row's first view."""
-        images = {"image": packed(shot.image.cpu()), "truth": packed(shot.truth.cpu())}
-        self._shots.append({name: getattr(shot, name) for name in SHOT_FACTS} | images)
         if self._other:
+            images = {"image": packed(shot.image.cpu()), "truth": packed(shot.truth.cpu())}
+            self._shots.append({name: getattr(shot, name) for name in SHOT_FACTS} | images)
             self._other.shot(shot)
 
     def adapted(self, row: str, adapted: Adapted) -> None:
-        """Keep a report."""
         self._reports.append((row, adapted.report.model_dump(mode="json")))
         if self._other:
             self._other.adapted(row, adapted)
 
     def restored(self, row: str, report: dict[str, Any]) -> None:
-        """Tell the other watcher."""
         if self._other:
             self._other.restored(row, report)
 
     def taken(self) -> dict[str, Any]:
         """What was kept; without images if nobody watches."""
-        return {"shots": self._shots if self._other else [], "reports": self._reports}
+        return {"shots": self._shots, "reports": self._reports}
 
     def replay(self, kept: dict[str, Any], camera: Camera) -> None:
         """Tell the other watcher what was kept of a row; `camera`: of the first view."""
+        if self._other is None:
+            return
         for row, report in kept["reports"]:
-            self.restored(row, report)
-        for shot in kept["shots"] if self._other else ():
-            images = {name: unpacked(shot[name]) for name in ("image", "truth")}
-            self._other.shot(Shot(camera=camera, **{**shot, **images}))  # type: ignore[union-attr]  # the loop is empty without it
+            self._other.restored(row, report)
+        for shot in kept["shots"]:
+            self._other.shot(Shot(camera=camera, **shot | {name: unpacked(shot[name]) for name in ("image", "truth")}))

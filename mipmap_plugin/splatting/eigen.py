@@ -55,7 +55,12 @@ def by_axes(gaussians: Gaussians) -> Gaussians:
     """The same splats, their covariances as quaternions and scales. No gradient."""
     if gaussians.covariances is None:
         return gaussians
-    variances, directions = eigh3(gaussians.covariances.detach().double())
+    quats, scales = quats_and_scales(gaussians.covariances.detach().double())
+    return replace(gaussians, quats=quats.to(gaussians.quats), scales=scales.to(gaussians.scales), covariances=None)
+
+
+def quats_and_scales(covariances: Tensor) -> tuple[Tensor, Tensor]:
+    """Quaternions wxyz [N, 4] and scales [N, 3] of splats with these covariances [N, 3, 3]. No gradient."""
+    variances, directions = eigh3(covariances)
     directions = directions * torch.linalg.det(directions).sign()[:, None, None]  # rotations, not reflections
-    quats, scales = quaternions(directions).to(gaussians.quats), variances.clamp_min(0).sqrt().to(gaussians.scales)
-    return replace(gaussians, quats=quats, scales=scales, covariances=None)
+    return quaternions(directions), variances.clamp_min(0).sqrt()

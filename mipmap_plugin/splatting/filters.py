@@ -80,12 +80,7 @@ class Footprint:
 
 
 def footprint(
-    projected: Projected,
-    opacities: Tensor,
-    screen_filter: str,
-    eps2d: float,
-    settings: RenderSettings = USUAL,
-    max_variance: float = math.inf,
+    projected: Projected, opacities: Tensor, screen_filter: str, eps2d: float, settings: RenderSettings = USUAL, max_variance: float = math.inf
 ) -> Footprint | PixelIntegral:
     """Footprints of splats under a screen filter and a viewer's settings.
 

@@ -55,9 +55,7 @@ class Viewer:
         """`effects` under this viewer's convention. The near plane changes only if the viewer has one."""
         near = effects.near_plane if self.near_plane is None else self.near_plane
         degree = min(effects.sh_degree, self.sh_degree)
-        return replace(
-            effects, sh_degree=degree, screen_filter=self.screen_filter, eps2d=self.eps2d, near_plane=near, settings=self.settings
-        )
+        return replace(effects, sh_degree=degree, screen_filter=self.screen_filter, eps2d=self.eps2d, near_plane=near, settings=self.settings)
 
 
 # `Viewer.read_degrees` of loaders that refuse degree 4, or take its columns for those of degree 3; and of those that read all that is neither 0 nor 3

@@ -111,10 +111,6 @@ def test_samples_are_clamped_before_they_are_averaged():
     torch.testing.assert_close(show["supersampling, 4 x 4"](view), show["base, resized"](view), atol=1e-5, rtol=0)
 
 
-def test_every_protocol_names_the_filter_that_makes_its_truth():
-    assert {name: each.shrink_by for name, each in PROTOCOLS.items()} == {"P1": "box", "P3": "pil-bicubic", "P4": "lanczos"}
-
-
 def test_the_base_resized_is_the_ceiling_of_what_is_judged_by_the_same_filter(tmp_path):
     """The photographs are the base's own images: only the filter is between them and the truth."""
     model, scene = wrapped(), load_scene(tiny.scene(tmp_path / "scene", count=30))

@@ -54,13 +54,13 @@ def test_the_truth_of_a_zoomed_view_is_the_bases_own_image():
     torch.testing.assert_close(truth(view.zoomed(0.5)), resize(image, (6, 8), "pil-bicubic"), atol=1 / STEPS, rtol=0)
 
 
-@pytest.mark.parametrize(
-    ("band", "reason"),
-    [((0.5, 4.0), "a band ends at the base's scale"), ((2.0, 1.0), "^setting band: must rise, got"), ((0.0, 1.0), "each a number above 0, got")],
-)
-def test_impossible_bands_are_refused(band, reason):
+@pytest.mark.parametrize(("scale", "band", "reason"), [
+    (1 / 2, (0.5, 4.0), "a band ends at the base's scale"), (2, (0.1, 0.4), "x2 would be shown up to x2, but a band ends at the base's scale"),
+    (1 / 2, (2.0, 1.0), "^setting band: must rise, got"), (1 / 2, (0.0, 1.0), "each a number above 0, got"),
+])  # fmt: skip
+def test_impossible_bands_are_refused(scale, band, reason):
     with pytest.raises(SettingsError, match=reason):
-        recipe("default", 1 / 2, band=band)
+        recipe("default", scale, band=band)
 
 
 def test_a_band_is_adapted_to():

@@ -145,6 +145,7 @@ def test_a_splat_ends_and_is_covered_as_in_the_program(backend, viewer, radius, 
 @BOTH
 def test_lichtfeld_draws_half_a_step_of_8_bits_and_limits_no_color(backend):
     """Its rasterizer of 2026; that of 2025 drew as Brush does."""
+
     def seen(viewer, opacity):
         return alpha(backend, viewer, splat(900.0, 900.0, opacity)).max()
 

@@ -71,7 +71,6 @@ class Adam:
                 each.copy_(after)
 
     def zero_grad(self) -> None:
-        """Set all gradients to None."""
         for group in self.param_groups:
             for tensor in group["params"]:
                 tensor.grad = None

@@ -95,9 +95,7 @@ def strongest(gradients: Tensor, threshold: float, max_count: int) -> Tensor:
     return torch.zeros_like(selected).index_fill(0, gradients.topk(max(0, max_count)).indices, True)
 
 
-def clone_and_split(
-    model: SplatModel, optimizer: Adam, selected: Tensor, extent: float, splats: Gaussians, generator: torch.Generator
-) -> None:
+def clone_and_split(model: SplatModel, optimizer: Adam, selected: Tensor, extent: float, splats: Gaussians, generator: torch.Generator) -> None:
     """Clone the small and split the large splats among the rows where `selected` [N] is True. `splats`: the model's activated splats.
 
     For families whose rows are splats (means, log scales and the rest by row). Anchors never move, so that they have no gradient to
@@ -148,9 +146,7 @@ def _in_world(offsets: Tensor, quats: Tensor) -> Tensor:
     return (rotations(quats) @ offsets[..., None])[..., 0]
 
 
-def _grow(
-    model: SplatModel, optimizer: Adam, kept: Tensor, parents: Tensor, offsets: Tensor, change: Callable[[str, Tensor], None]
-) -> None:
+def _grow(model: SplatModel, optimizer: Adam, kept: Tensor, parents: Tensor, offsets: Tensor, change: Callable[[str, Tensor], None]) -> None:
     """Keep the rows where `kept` [N] is True, and append a child of each of the `parents` [M], displaced by `offsets` [M, 3].
 
     `change` modifies the children's other parameters in place.

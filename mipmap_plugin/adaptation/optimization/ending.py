@@ -35,6 +35,6 @@ class End(Enum):
             case End.TARGET:
                 return f"target of {config.target_db:g} dB against the pseudo truth"
             case End.KNEE:
-                return f"knee: {config.patience} checks in a row gained less than {config.min_gain_db:g} dB"
+                return f"knee: {plural(config.patience or 0, 'check')} in a row gained less than {config.min_gain_db:g} dB"
             case End.OBSERVER:
                 return str(self.value)

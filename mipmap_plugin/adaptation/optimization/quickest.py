@@ -17,8 +17,6 @@ FIRST_INTERVAL, LONGEST_INTERVAL = 32, 512
 
 
 class QuickestThreads:
-    """Chooses the number of threads of each step."""
-
     def __init__(self) -> None:
         self._most = threads.for_views()
         self._best, self._interval = self._most, FIRST_INTERVAL

@@ -11,7 +11,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, progress
+from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel
 from mipmap_plugin.adaptation.following import Following
 from mipmap_plugin.adaptation.optimization.adam import Adam
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
@@ -55,7 +55,6 @@ class Task:
 
     @cached_property
     def cameras(self) -> Mapping[Camera, Camera]:
-        """The camera of the new scale of each view."""
         return {view: view.zoomed(self.scale) for view in self.views}
 
     def images(self, gaussians: Gaussians, cameras: Sequence[Camera], draw: int) -> list[Tensor]:
@@ -129,7 +128,9 @@ class Run:
 
     def progress(self, config: AdaptConfig) -> float:
         """Fraction (0..1) of the steps that is over, or of what the start left of the time budget, whichever is larger."""
-        return progress(self.step, self.seconds, config, self.curve[0].seconds + self.reserved)
+        before = self.curve[0].seconds + self.reserved
+        left = math.inf if config.time_budget_s is None else max(config.time_budget_s - before, 1e-9)
+        return min(1.0, max(self.step / max(1, config.steps), (self.seconds - before) / left))
 
     @property
     def seconds(self) -> float:

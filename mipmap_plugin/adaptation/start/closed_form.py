@@ -101,7 +101,6 @@ class _Change:
 
     @cached_property
     def zoomed(self) -> list[Camera]:
-        """The views at the new scale."""
         return [view.zoomed(self.scale) for view in self.views]
 
     def of(self, gaussians: Gaussians, base_pixel: Tensor) -> tuple[Tensor, Tensor]:

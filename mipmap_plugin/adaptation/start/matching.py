@@ -28,9 +28,7 @@ HARDLY_SEEN = 1e-3
 
 
 @torch.no_grad()
-def matched_opacities(
-    opacities: Tensor, target: Tensor, whole: Tensor, weights_of: Callable[[Tensor], Tensor], rounds: int = ROUNDS
-) -> Tensor:
+def matched_opacities(opacities: Tensor, target: Tensor, whole: Tensor, weights_of: Callable[[Tensor], Tensor], rounds: int = ROUNDS) -> Tensor:
     """Opacities [N] for which `weights_of(opacities)`, the mean blend weight [N] of each splat in pixels, is close to `target` [N].
 
     `whole` [N]: the weights of splats that nothing hides (`blend_weights.whole_weights`).

@@ -20,9 +20,9 @@ from mipmap_plugin.adaptation.parallel import CHUNK, in_chunks
 from mipmap_plugin.backends.cpu import nearest_along
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.process import threads
-from mipmap_plugin.splatting.eigen import eigh3
+from mipmap_plugin.splatting.eigen import quats_and_scales
 from mipmap_plugin.splatting.harmonics import C0
-from mipmap_plugin.splatting.rotations import quaternions, rotations
+from mipmap_plugin.splatting.projection import axes_of
 
 # Target pixels: a difference from black to white in one channel counts as this distance.
 CONTRAST = 20.0
@@ -150,7 +150,7 @@ class _Moments:
     @staticmethod
     def _of_chunk(gaussians: Gaussians, pixel: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Covariances, depth, color and weights."""
-        axes = (rotations(gaussians.quats) * gaussians.scales[:, None, :]).double()
+        axes = axes_of(gaussians.quats, gaussians.scales).double()
         covariances = axes @ axes.mT
         depth = -torch.log1p(-gaussians.opacities.clamp_max(MAX_OPACITY)) * _surface(covariances)
         color = CONTRAST * (0.5 + C0 * gaussians.sh[:, 0]).clamp(0, 1)
@@ -160,9 +160,7 @@ class _Moments:
     def pairs(self, shift: Tensor) -> tuple[Tensor, Tensor]:
         """Return pairs of rows that are each other's nearest neighbors, by rising cost. `shift` [3], 0..1, moves the space-filling curve."""
         order = along_curve(self.means, self.pixel.median(), shift)
-        means, shapes, color, weights, pixel = (
-            tensor[order] for tensor in (self.means, self.covariances, self.color, self.weights, self.pixel)
-        )
+        means, shapes, color, weights, pixel = (tensor[order] for tensor in (self.means, self.covariances, self.color, self.weights, self.pixel))
         found = nearest_along(means, shapes, color, weights, pixel, reach=NEIGHBORS, limits=(MAX_DISTANCE**2, MAX_COST))
         nearest, least = found or _nearest_along(means, shapes, color, weights, pixel)
         position = torch.arange(len(order), device=order.device)
@@ -193,11 +191,10 @@ class _Moments:
     def gaussians(self, before: Gaussians, rows: Tensor, old_weights: Tensor) -> Gaussians:
         """Return the merged splats. `rows` [N0]: the new row of each splat of `before`. Splats that were not merged stay bit-identical."""
         count = len(self.weights)
-        is_merged = torch.zeros(count, dtype=torch.long, device=rows.device).index_add_(0, rows, torch.ones_like(rows)) > 1
+        is_merged = rows.bincount(minlength=count) > 1
         if not is_merged.any():
             return before
         origin = torch.zeros_like(rows[:count]).index_copy_(0, rows, torch.arange(len(rows), device=rows.device))
-
         merged = is_merged.nonzero()[:, 0]
 
         def replaced(old: Tensor, values: Tensor) -> Tensor:
@@ -212,10 +209,9 @@ class _Moments:
 
     def _shapes(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Quaternions [n, 4], scales [n, 3] and opacities [n] of some rows."""
-        variances, directions = eigh3(self.covariances[rows])
-        directions = directions * torch.linalg.det(directions).sign()[:, None, None]  # rotations, not reflections
-        opacities = -torch.expm1(-self.depth[rows] / _surface(self.covariances[rows]))
-        return quaternions(directions), variances.clamp_min(0).sqrt(), opacities.clamp_max(MAX_OPACITY)
+        covariances = self.covariances[rows]
+        opacities = -torch.expm1(-self.depth[rows] / _surface(covariances))
+        return *quats_and_scales(covariances), opacities.clamp_max(MAX_OPACITY)
 
     def _mean_harmonics(self, old: Tensor, rows: Tensor, old_weights: Tensor) -> Tensor:
         """The harmonics [N, K, 3] of merged splats, from the `old` ones [N0, K, 3]: each thread sums some of the coefficients."""

@@ -86,4 +86,3 @@ def _from_different_places(cameras: Sequence[Camera]) -> list[Camera]:
         if not any(torch.allclose(camera.viewmat, other.viewmat, rtol=SAME_POSE, atol=SAME_POSE) for other in found):
             found.append(camera)
     return found
-

@@ -23,10 +23,7 @@ Upsampler = Callable[[Tensor, tuple[int, int]], Tensor]
 # Colors are 0..1, and what sharpens goes a little beyond. Farther beyond, an image is one of another range, such as 0..255.
 LOWEST, HIGHEST = -1.0, 2.0
 
-UPSAMPLERS = Registry(
-    "mipmap_plugin.upsamplers",
-    {name: f"mipmap_plugin.adaptation.target.upsamplers:{name}" for name in ("bicubic", "lanczos")},
-)
+UPSAMPLERS = Registry("mipmap_plugin.upsamplers", {name: f"mipmap_plugin.adaptation.target.upsamplers:{name}" for name in ("bicubic", "lanczos")})
 
 # Where the file of a network lies here that settings name by its path on another machine, by that name.
 _PLACED: ContextVar[tuple[str, Path] | None] = ContextVar("placed", default=None)

@@ -14,10 +14,11 @@ from typing import Any
 
 import torch
 
+from mipmap_plugin.adaptation.plot import figure_class
 from mipmap_plugin.adaptation.report import versions
 from mipmap_plugin.evaluation.report import markdown
 from mipmap_plugin.evaluation.tradeoff.front import Tradeoff, files, frames, front, milliseconds, seconds
-from mipmap_plugin.evaluation.tradeoff.plot import draw, figure_class
+from mipmap_plugin.evaluation.tradeoff.plot import OTHERWISE, draw
 from mipmap_plugin.evaluation.tradeoff.points import Point, Spread
 from mipmap_plugin.formats.atomic import new_file, refuse_output, refuse_unwritable, settled, together, write_json
 from mipmap_plugin.models.places import PAGE, page_at
@@ -44,8 +45,6 @@ def _facts_of(each: Tradeoff) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Folder:
-    """The folder that a tradeoff is written to."""
-
     path: Path
     picture: bool  # whether to write the plot
     overwrite: bool
@@ -65,7 +64,7 @@ def goes_on(folder: Folder) -> Folder:
 def refuse(folder: Folder) -> None:
     """Raise now the errors that `write` would raise at the end: OutputExists, and SettingsError without matplotlib."""
     if folder.picture:
-        figure_class()
+        figure_class(OTHERWISE)
     overwrite = goes_on(folder).overwrite
     for name in NAMES:
         refuse_output(folder.path / name, overwrite, is_file=True)

@@ -26,7 +26,6 @@ class Tradeoff:
 
 
 def seconds(point: Point) -> float:
-    """The seconds of adapting of a point."""
     return point.adapt_seconds.median
 
 

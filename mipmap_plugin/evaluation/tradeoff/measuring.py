@@ -100,6 +100,7 @@ class _Measurement:
         if backend not in self._warm:
             warm_up(model, scale, truth.adapt_on)
             self._warm.add(backend)
+        cameras = [replace(view, split="train") for view in truth.adapt_on] or None  # however the checkpoint marks them
         measured: dict[int, list[tuple[float, float]]] = {}  # by step: seconds and dB of each repeat that took as many steps
 
         @torch.no_grad()
@@ -108,14 +109,16 @@ class _Measurement:
                 quality = statistics.fmean(truth.psnr(view, show(view.zoomed(scale))) for view in truth.views)
                 measured.setdefault(step, []).append((seconds, quality))
 
+        title = recipe if steps is None else f"{recipe}, {plural(steps, 'step')} at most"
         first: Adapted | None = None
         ends = list[Point]()
         for repeat in range(plan.repeats):
             settings: dict[str, Any] = {"seed": plan.seed + repeat} | ({} if steps is None else {"steps": steps})
-            adapted = adapt_alone(model, scale, recipe=recipe, viewer=plan.viewer, cameras=truth.adapt_on or None, observe=observe, **settings)
+            adapted = adapt_alone(model, scale, recipe=recipe, viewer=plan.viewer, cameras=cameras, observe=observe, **settings)
             first, report = first or adapted, adapted.report
-            end = Point(scale, "adapted", _name(recipe, steps), adapted.backend.name, report.gaussians_after, ended_by=report.ended_by)
-            ends.append(_measured(replace(end, adapt_seconds=Spread.of([report.seconds["total"]])), _shows(adapted, scale), truth, 1))
+            spent = Spread.of([report.seconds["total"]])
+            end = Point(scale, "adapted", title, adapted.backend.name, report.gaussians_after, adapt_seconds=spent, ended_by=report.ended_by)
+            ends.append(_measured(end, partial(_shown, adapted), truth, 1))
             bar.update()
         assert first is not None  # since there is at least one repeat
         if (recipe, steps, backend) == self._runs[0]:
@@ -125,7 +128,7 @@ class _Measurement:
         def between(step: int, values: Sequence[tuple[float, float]]) -> Point:
             splats = next((point.gaussians for point in reversed(curve) if point.step <= step), intermediate.gaussians)
             seconds, qualities = zip(*values, strict=True)
-            return replace(intermediate, step=step, gaussians=splats, **_spreads(adapt_seconds=seconds, psnr_db=qualities))
+            return replace(intermediate, step=step, gaussians=splats, adapt_seconds=Spread.of(seconds), psnr_db=Spread.of(qualities))
 
         return [*(between(step, values) for step, values in measured.items()), _over_repeats(ends)]
 
@@ -178,22 +181,14 @@ def _measured(point: Point, show: RenderView, truth: GroundTruth, repeats: int) 
     return replace(point, psnr_db=Spread.of([statistics.fmean(psnrs)]), ms_per_frame=Spread.of(times))
 
 
-def _name(recipe: str, steps: int | None) -> str:
-    return recipe if steps is None else f"{recipe}, {plural(steps, 'step')} at most"
-
-
-def _spreads(**values: Sequence[float]) -> dict[str, Any]:
-    return {name: Spread.of(repeats) for name, repeats in values.items()}
-
-
 def _over_repeats(ends: Sequence[Point]) -> Point:
     """The final points of all repeats as one point."""
-    measured = {name: [getattr(end, name).median for end in ends] for name in ("psnr_db", "adapt_seconds", "ms_per_frame")}
-    return replace(ends[0], ended_by="; ".join(dict.fromkeys(end.ended_by for end in ends)), **_spreads(**measured))
+    spreads: dict[str, Any] = {name: Spread.of([getattr(end, name).median for end in ends]) for name in ("psnr_db", "adapt_seconds", "ms_per_frame")}
+    return replace(ends[0], ended_by="; ".join(dict.fromkeys(end.ended_by for end in ends)), **spreads)
 
 
-def _shows(adapted: Adapted, scale: float) -> RenderView:
-    return lambda view: adapted.render(view.zoomed(scale)).image
+def _shown(adapted: Adapted, view: Camera) -> Tensor:
+    return adapted.render(view.zoomed(adapted.report.scale)).image
 
 
 def _renderers(model: Wrapped, adapted: Adapted | None, scale: float) -> Iterator[tuple[Point, RenderView]]:

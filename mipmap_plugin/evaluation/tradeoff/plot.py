@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mipmap_plugin.errors import SettingsError, install
+from mipmap_plugin.adaptation.plot import figure_class
 from mipmap_plugin.evaluation.tradeoff.front import Cost, Tradeoff, files, frames, front, knee, milliseconds, seconds
 from mipmap_plugin.evaluation.tradeoff.points import Point, Spread
 from mipmap_plugin.formats.atomic import new_file
@@ -20,16 +20,7 @@ BRIEF = 0.1
 
 TITLE_WIDTH = 95  # letters
 
-NO_MATPLOTLIB = f"plots need matplotlib; {install('plot')}; or leave them out with --no-picture"
-
-
-def figure_class() -> Any:
-    """matplotlib's Figure class, which needs no screen. Raises SettingsError without matplotlib."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise SettingsError(NO_MATPLOTLIB) from error
-    return Figure
+OTHERWISE = "; or leave them out with --no-picture"
 
 
 def draw(path: Path, tradeoffs: Sequence[Tradeoff], overwrite: bool) -> None:
@@ -37,7 +28,7 @@ def draw(path: Path, tradeoffs: Sequence[Tradeoff], overwrite: bool) -> None:
 
     Raises OutputExists, OutputError, and SettingsError without matplotlib.
     """
-    figure = figure_class()(figsize=(15, 5.4 * len(tradeoffs)), layout="constrained")
+    figure = figure_class(OTHERWISE)(figsize=(15, 5.4 * len(tradeoffs)), layout="constrained")
     for (left, right), each in zip(figure.subplots(len(tradeoffs), 2, squeeze=False, sharey="row"), tradeoffs, strict=True):
         colors = _colors(each.points)
         _seconds(left, each, colors)

@@ -55,8 +55,6 @@ class Point:
 
 @dataclass(frozen=True)
 class Plan:
-    """What to measure."""
-
     recipes: Sequence[str] = ("default",)
     steps: Sequence[int | None] = ()  # none: those of each recipe
     backends: Sequence[str] = ("auto",)

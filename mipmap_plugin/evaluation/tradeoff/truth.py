@@ -18,7 +18,7 @@ from mipmap_plugin.evaluation.judged import photographed_views
 from mipmap_plugin.evaluation.measure import RESIZED, resized_base, supersampled, views_seen
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.other_scene import of_another_scene, of_another_size
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, TruthView
+from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.scenes import Scene, jittered
 from mipmap_plugin.scenes.trajectories import with_company
 from mipmap_plugin.wrap import Wrapped
@@ -49,7 +49,7 @@ def photographs(model: Wrapped, scene: Scene, scale: float, most: int | None) ->
     """
     if doubt := of_another_size(model, scene):
         warn(doubt)
-    judged: dict[Camera, TruthView] = {view.camera: view for view in photographed_views(model, scene)}
+    judged = {view.camera: view for view in photographed_views(model, scene)}
     train = [camera for camera in model.cameras if camera.split == "train"] or model.cameras
     views, adapt_on = list(judged), _others(train, list(judged))
     if not adapt_on:
@@ -58,7 +58,8 @@ def photographs(model: Wrapped, scene: Scene, scale: float, most: int | None) ->
     if not adapt_on:
         raise SettingsError("every camera of the checkpoint is evaluated, so that none is left to adapt to; give photographs of fewer views")
     protocol, views = PROTOCOLS["P3"], evenly(views, most)
-    if doubt := of_another_scene(model, [judged[view] for view in views], scale, protocol):
+    if doubt := of_another_scene(model, [judged[view] for view in views]):
+        model.doubted = True  # at other scales it would be told again
         warn(doubt)
     truths = {view: judged[view].truth(scale, protocol) for view in views}
     label = f"real dB, protocol P3 on {plural(len(views), 'photograph')}"

@@ -18,6 +18,7 @@ from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.steering import Steering
 from mipmap_plugin.adaptation.optimization.validation import Validation, no_validation
+from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.recipes import recipe
 
 STILL = Following()
@@ -101,6 +102,16 @@ def test_time_is_kept_for_choosing_after_the_steps():
     assert run.progress(planned) == pytest.approx(0, abs=0.01)
     run.watch.seconds = 3.0 - PACE.a_choice
     assert run.progress(planned) == 1 and run.reason_to_stop(planned) is End.CHOICE
+
+
+def test_rates_decay_by_the_steps_or_by_the_budget_whichever_is_used_up_first():
+    def progress(step, seconds, before=0.0, budget=60.0):
+        run = a_run(seconds, step)
+        run.curve = [CurvePoint(step=0, seconds=before, validation_db=20.0, gaussians=5)]
+        return run.progress(AdaptConfig(steps=100, time_budget_s=budget))
+
+    assert [progress(*used) for used in ((0, 0.0), (50, 15.0), (10, 45.0), (100, 10.0), (5, 90.0))] == [0, 0.5, 0.75, 1, 1]
+    assert progress(25, 1e6, budget=None) == 0.25 and progress(0, 40.0, before=40.0) == 0 and progress(0, 50.0, before=40.0) == 0.5
 
 
 def test_steps_that_were_taken_before_the_first_check_are_not_told_as_the_start():

@@ -7,14 +7,7 @@ import tiny
 import torch
 
 from mipmap_plugin.adaptation.optimization.adam import ROWS, Adam
-from mipmap_plugin.adaptation.optimization.density import (
-    HALF_APART,
-    SPLIT_SHRINK,
-    clone_and_split,
-    halve,
-    prune,
-    reset_opacities,
-)
+from mipmap_plugin.adaptation.optimization.density import HALF_APART, SPLIT_SHRINK, clone_and_split, halve, prune, reset_opacities
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer, restore_parameters, set_rates
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera

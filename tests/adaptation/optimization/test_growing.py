@@ -16,7 +16,6 @@ from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
 from mipmap_plugin.config import LearningRates
-from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
@@ -159,7 +158,7 @@ def test_rows_that_are_as_many_but_others_have_no_columns_of_the_base(monkeypatc
     monkeypatch.setattr(Validation, "quality", lambda self, model: Quality(*[next(found)] * 2))
     chosen = lambda states: (list(states)[2], dict.fromkeys(states, 0.0), dict.fromkeys(states, ()))  # noqa: E731
     monkeypatch.setattr(Validation, "choose", lambda self, states, allowed: chosen(states))
-    base = VanillaModel(tiny.model(40).parameters(), origin=Origin(extras={"confidence": np.arange(40, dtype=np.float32)}))
+    base = tiny.model(40).with_extras({"confidence": np.arange(40, dtype=np.float32)})
     rates = LearningRates(means=0.05, scales=0.02, quats=0.004, opacities=0.05, sh0=0.015, shN=0.02)  # with which one splat is pruned
     settings = dict(most_growth=1, densify_gradient=1e-12, min_opacity=0.5, prune_every=1, steps=4, check_every=2, merge_to=1.0, warm_up=0)
     settings |= dict(rates=rates, views_per_step=3)

@@ -6,7 +6,6 @@ import tiny
 import torch
 
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
-from mipmap_plugin.models.vanilla import Origin, VanillaModel
 
 
 class Shared:
@@ -89,7 +88,7 @@ def test_shared_parameters_keep_their_leaves_whatever_the_rows():
 
 @pytest.mark.parametrize("rows_changed", [True, False])
 def test_columns_of_a_file_stay_with_the_rows_that_they_belong_to(rows_changed):
-    began = VanillaModel(tiny.model(5).parameters(), origin=Origin(extras={"confidence": np.arange(5, dtype=np.float32)}))
+    began = tiny.model(5).with_extras({"confidence": np.arange(5, dtype=np.float32)})
     taken = Snapshot.of(tiny.model(5, seed=1), rows_changed)
     held = taken.over(began)
     assert all(torch.equal(tensor, taken.rows[name]) for name, tensor in held.parameters().items())

@@ -26,13 +26,15 @@ def test_neighbors_of_a_spread_round_are_of_all_parts_of_the_scene():
     assert len({tuple(view.viewmat[0, 3].item() for view in drawn[start : start + 24]) for start in (0, 24, 48)}) == 3  # each round is another
 
 
+@pytest.mark.parametrize("spread_out", [False, True])
 @pytest.mark.parametrize("count", [1, 2, 5, 12])
-def test_spread_rounds_show_every_view_once_and_start_anywhere(count):
+def test_rounds_show_every_view_once_and_start_anywhere(count, spread_out):
     views = tiny.cameras(count)
-    drawn = [Rounds(views, seed=2, spread_out=True)(draw) for draw in range(3 * count)]
-    rounds = Rounds(views, seed=2, spread_out=True)
-    assert [rounds(draw) for draw in range(3 * count)] == drawn
+    rounds, other = (Rounds(views, seed=seed, spread_out=spread_out) for seed in (2, 3))
+    drawn = [rounds(draw) for draw in range(3 * count)]
+    assert [Rounds(views, seed=2, spread_out=spread_out)(draw) for draw in range(3 * count)] == drawn
     assert all(set(drawn[start : start + count]) == set(views) for start in range(0, 3 * count, count))
+    assert count < 12 or drawn[:count] not in (drawn[count : 2 * count], [other(draw) for draw in range(count)])
 
 
 def test_views_of_one_place_are_told_apart_by_where_they_look():

@@ -13,7 +13,7 @@ from mipmap_plugin.adaptation.optimization.costs import Costs
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.torch_file import load_torch
-from mipmap_plugin.models.vanilla import Origin, VanillaModel
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
 
@@ -24,8 +24,7 @@ def anew(base, settings):
 
 def with_extras(path):
     """A checkpoint with a column that 3DGS does not know."""
-    model = tiny.model(40)
-    return VanillaModel(model.parameters(), origin=Origin(extras={"confidence": np.arange(40, dtype=np.float32)})).save(path, provenance={})
+    return tiny.model(40).with_extras({"confidence": np.arange(40, dtype=np.float32)}).save(path, provenance={})
 
 
 @pytest.mark.parametrize("nth", [1, 2, 5, 7])  # the first step; before and after a pruning; the last step

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny import cameras, gaussians, model
+from tiny import cameras, model
 
 from mipmap_plugin.adaptation.start.blend_weights import _color_gradient, blend_weights, may_show, weighed, whole_weights
 from mipmap_plugin.backends import get_backend
@@ -86,9 +86,7 @@ def test_what_lies_behind_the_camera_has_none():
 
 
 @pytest.mark.parametrize(
-    "effects",
-    [Effects(0), Effects(0, "analytic"), Effects(0, settings=replace(USUAL, min_variance=1.0))],
-    ids=["classic", "analytic", "culled"],
+    "effects", [Effects(0), Effects(0, "analytic"), Effects(0, settings=replace(USUAL, min_variance=1.0))], ids=["classic", "analytic", "culled"]
 )
 def test_one_pass_finds_the_same_weights_as_gradients(effects):
     pytest.importorskip("numba")
@@ -106,8 +104,3 @@ def test_weights_over_windows_are_found_from_gradients():
     assert get_backend("cpu").blend_weights(splats, views[0], Effects(1, "window")) is None
     windows, pixels = (blend_weights(splats, views, get_backend("cpu"), Effects(1, name)).sum() for name in ("window", "classic"))
     assert 0.5 * pixels < windows < pixels
-
-
-def test_a_mask_of_other_splats_is_refused():
-    with pytest.raises(IndexError, match=r"a mask of 8 splats has shape \[8\], not \[3\]"):
-        gaussians(8)[torch.tensor([True, False, True])]

@@ -38,10 +38,6 @@ def test_what_a_start_was_searched_with_is_gone_during_the_steps(monkeypatch):
     assert found and left and not any(left)
 
 
-def test_the_closed_form_is_where_a_run_starts():
-    assert start_of(adapted().report) == "the closed form"
-
-
 @pytest.mark.parametrize(("psnr", "told"), [(30.0, "holds the base as it is, for nothing was better: 30.00 dB"), (31.0, "30.00 -> 31.00 dB")])
 def test_a_start_with_which_nothing_was_done_to_the_base_is_told_as_the_base(psnr, told):
     report = Report.model_construct(returned=UNCHANGED, validation={AS_IT_IS: 30.0, UNCHANGED: psnr})
@@ -82,9 +78,7 @@ def test_crispness_reaches_the_start():
 
 
 @pytest.mark.parametrize(
-    ("scale", "tried"),
-    [(1.05, [0.5, 1.0]), (2, [0.5]), (1 / 2, [0.0])],
-    ids=["a small zoom-in", "one that does not tell", "a zoom-out"],
+    ("scale", "tried"), [(1.05, [0.5, 1.0]), (2, [0.5]), (1 / 2, [0.0])], ids=["a small zoom-in", "one that does not tell", "a zoom-out"]
 )
 def test_a_start_without_steps_is_as_crisp_as_views_show(scale, tried, monkeypatch):
     """At x1.05 thin wires were up to 0.5 dB worse than in the base."""

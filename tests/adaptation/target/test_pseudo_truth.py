@@ -7,7 +7,7 @@ import tiny
 import torch
 
 from mipmap_plugin.adaptation import views as views_module
-from mipmap_plugin.adaptation.schedule import Rounds, ViewSchedule
+from mipmap_plugin.adaptation.schedule import ViewSchedule
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import resize
@@ -144,17 +144,6 @@ def test_without_cameras_there_is_an_orbit(policy):
     (views, which), _ = chosen(policy, cameras=[], extra_views=5)
     assert which == f"5 views of a generated orbit at {views_module.ORBIT_PIXELS} px (the checkpoint came without cameras)"
     assert len(views) == 5
-
-
-def test_rounds_show_every_view_once_and_start_anywhere():
-    views = tiny.cameras(5)
-    rounds = Rounds(views, seed=2)
-    drawn = [rounds(draw) for draw in range(15)]
-    for start in (0, 5, 10):
-        assert set(drawn[start : start + 5]) == set(views)
-    assert drawn[:5] != drawn[5:10]
-    assert [Rounds(views, seed=2)(draw) for draw in range(15)] == drawn
-    assert [Rounds(views, seed=3)(draw) for draw in range(15)] != drawn
 
 
 def test_views_are_spread_over_their_order():

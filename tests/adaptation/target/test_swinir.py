@@ -76,13 +76,6 @@ def test_an_image_larger_than_a_tile_has_no_seam(swinir, tmp_path, monkeypatch):
     torch.testing.assert_close(enlarged, own_image(network, image), atol=5e-4, rtol=0)
 
 
-def test_an_image_is_enlarged_once(swinir, tmp_path, monkeypatch):
-    path, image = saved(tmp_path / "net.pth", swinir(2, LIGHT)), picture(8, 8)
-    first = Network(path)(image, (16, 16))
-    monkeypatch.setattr(super_resolution, "_in_tiles", None)
-    assert torch.equal(Network(path)(image, (16, 16)), first)
-
-
 def test_it_is_fused_with_the_base_at_zoom_in(swinir, tmp_path):
     path = saved(tmp_path / "net.pth", swinir(2, LIGHT))
     views = tiny.cameras(2)

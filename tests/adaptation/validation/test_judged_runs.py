@@ -19,7 +19,7 @@ from mipmap_plugin.adaptation.start import candidates as start
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.formats.ply import read_ply
-from mipmap_plugin.models.vanilla import Origin, VanillaModel
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
@@ -133,7 +133,7 @@ def test_a_run_that_ends_between_two_checks_is_looked_at_all_the_same(monkeypatc
 
 def with_extras() -> VanillaModel:
     """A model with a column that 3DGS does not know."""
-    return VanillaModel(tiny.model(40).parameters(), origin=Origin(extras={"confidence": np.arange(40, dtype=np.float32)}))
+    return tiny.model(40).with_extras({"confidence": np.arange(40, dtype=np.float32)})
 
 
 @pytest.mark.parametrize(("at", "pruned"), [(2, True), (3, True), (5, False)])  # at a check that takes back, and between two

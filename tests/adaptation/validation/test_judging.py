@@ -10,14 +10,7 @@ import torch
 from equal_models import SCALE
 
 from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR
-from mipmap_plugin.adaptation.optimization.validation import (
-    TIE_DB,
-    VALIDATION_EVERY,
-    VISIBLE_ERROR,
-    WINDOW,
-    Validation,
-    split_validation,
-)
+from mipmap_plugin.adaptation.optimization.validation import TIE_DB, VALIDATION_EVERY, VISIBLE_ERROR, WINDOW, Validation, split_validation
 from mipmap_plugin.adaptation.viewpoints import Viewpoints
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.models.base import Traits

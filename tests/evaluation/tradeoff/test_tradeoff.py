@@ -109,6 +109,16 @@ def test_everything_that_needs_no_adapting_stands_beside_the_adapted(points):
     assert all(point.adapt_seconds.high == 0 for point in points if point.kind in ("base", "filter", "supersampling"))
 
 
+@pytest.mark.parametrize("photographed", [True, False], ids=["photographs", "no photographs"])
+def test_where_all_cameras_are_marked_as_for_testing_the_rest_is_adapted_to(tmp_path, photographed):
+    """As those of a scene that holds its test part alone: the first run was refused, with advice for another command."""
+    views = [replace(view, split="test") for view in tiny.cameras(3)]
+    model = wrapped(views)
+    truth = photographs(model, load_scene(tiny.scene(tmp_path, views)), 1 / 4, None) if photographed else base_itself(model, 1 / 4, None)
+    points = measure(model, truth, 1 / 4, replace(PLAN, steps=(1,), repeats=1))
+    assert len(truth.adapt_on) == 2 and "adapted" in [point.kind for point in points]
+
+
 def test_a_filter_that_the_backend_lacks_is_named(monkeypatch):
     few = replace(ReferenceBackend.capabilities, screen_filters=frozenset({"classic", "antialiased", "mip", "analytic"}))
     monkeypatch.setattr(ReferenceBackend, "capabilities", few)
