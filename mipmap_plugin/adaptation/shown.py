@@ -198,11 +198,13 @@ def too_small(views: Sequence[Camera], model: SplatModel, near: float, least: fl
     reach = (splats.means - center).norm(dim=1) + SEEN * splats.scales.abs().amax(1)
     width = 2 * float(reach.kthvalue(max(1, round(FRAMED * len(reach)))).values)
     middle = center.tolist()
-    most = max(width * view.fx / max(math.dist(view.center.tolist(), middle), near) for view in views)
+    away = [math.dist(view.center.tolist(), middle) for view in views]
+    most = max(width * view.fx / max(distance, near) for view, distance in zip(views, away, strict=True))
     if not most < least:
         return ""
     wrong = "the cameras seem to be in other units; give those of this scene"
-    if max(view.fx for view in views) * width / least < width / 2 + CLEAR * near:
+    wanted, allowed = max(view.fx for view in views) * width / least, width / 2 + CLEAR * near  # distances at which it is large, and is drawn whole
+    if width / 2 < wanted < allowed and min(away) < 2 * allowed:
         wrong = f"renderers of 3DGS draw nothing nearer than {near:g} units; {SCALE_UP}"
     elif len(splats) <= most**2:
         return ""

@@ -106,6 +106,14 @@ def test_a_scene_in_small_units_is_told_of_where_the_near_plane_keeps_an_orbit_a
         wrap_model(tiny.model(), cameras=[view.moved(far) for view in tiny.cameras(2)]).adapt(0.5, recipe="instant")
 
 
+def test_the_near_plane_is_not_blamed_where_it_keeps_no_camera_away():
+    """Scaled up with its cameras, such a scene would look the same: it is far away, or the lens is wide."""
+    far, wide = tiny.cameras(2), [replace(view, fx=1.0, fy=1.0) for view in tiny.cameras(2)]
+    for model, views in ((shrunk(0.02), far), (tiny.model(300), wide)):
+        with pytest.raises(SettingsError, match=r"no view shows it larger than \S+ px: the cameras seem to be in other units"):
+            wrap_model(model, cameras=views).adapt(0.5, recipe="instant")
+
+
 @pytest.mark.parametrize(("count", "spread"), [(1, 0.0), (5, 0.1)])
 def test_few_splats_may_be_small_as_they_are_as_large_as_pixels(count, spread):
     far = torch.diag(torch.tensor([3.0, 3.0, 3.0, 1.0], dtype=torch.float64))
