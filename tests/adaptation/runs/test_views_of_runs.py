@@ -8,7 +8,7 @@ import tiny
 import torch
 from brief_runs import is_finite, shrunk
 
-from mipmap_plugin.adaptation.shown import remarks, worse_views
+from mipmap_plugin.adaptation.shown import far_apart, remarks, worse_views
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
@@ -104,6 +104,12 @@ def test_a_scene_in_small_units_is_told_of_where_the_near_plane_keeps_an_orbit_a
     with pytest.raises(SettingsError, match="the cameras seem to be in other units"):
         far = torch.diag(torch.tensor([100.0, 100.0, 100.0, 1.0], dtype=torch.float64))
         wrap_model(tiny.model(), cameras=[view.moved(far) for view in tiny.cameras(2)]).adapt(0.5, recipe="instant")
+
+
+def test_things_far_apart_are_told_of_where_an_orbit_shows_them_as_specks():
+    room = 10 * torch.rand(2000, 3, generator=torch.Generator().manual_seed(0))
+    assert re.match(r"the splats are a few things, 1,\d+ units apart, ", far_apart(torch.cat([room, room + 1000])))
+    assert far_apart(room) == far_apart(torch.cat([room, room + 20])) == far_apart(room * 0) == far_apart(room[:5]) == ""
 
 
 def test_the_near_plane_is_not_blamed_where_it_keeps_no_camera_away():
