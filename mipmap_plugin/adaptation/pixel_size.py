@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -42,9 +43,11 @@ def views_for(share: float) -> int:
     return count
 
 
-def pixel_size(means: Tensor, views: Sequence[Camera], count: int | None = None) -> Tensor:
-    """The size of a pixel at each mean in the closest view that sees it (of all views, if none does): [N] in world units.
+def pixel_size(means: Tensor, views: Sequence[Camera], count: int | None = None, most: float = 0.0) -> Tensor:
+    """The size of a pixel at each mean in the closest view that sees it: [N] in world units.
 
+    What no view sees has the size in the closest of all views, but at most `most` or the largest of what is seen: nobody says that it is looked at
+    from here, and another room, a kilometer away, would become a blur. If nothing at all is seen, there is no such limit.
     Of many views only some are used, evenly spread: CLOSEST_OF times `count`, by default `enough_views`; and more for splats that few of these see.
     """
     some = every_nth(views, _closest_of(means, views, count))
@@ -54,7 +57,10 @@ def pixel_size(means: Tensor, views: Sequence[Camera], count: int | None = None)
     if len(rare) and len(further) > len(some):
         finest[rare] = torch.minimum(finest[rare], _finest(means[rare], further)[0])
     unseen = finest.isinf()
-    return finest.masked_scatter(unseen, _nearest(means[unseen], some)) if unseen.any() else finest
+    if not unseen.any():
+        return finest
+    largest = torch.cat([finest[~unseen], finest.new_tensor([most])]).max().item() or math.inf
+    return finest.masked_scatter(unseen, _nearest(means[unseen], some).clamp_max(largest))
 
 
 def target_pixel(model: SplatModel, views: Sequence[Camera], scale: float) -> float:
@@ -81,7 +87,10 @@ def mean_pixel_size(means: Tensor, views: Sequence[Camera], count: int | None = 
 
     found = torch.cat(in_chunks(of_chunk, means))
     unseen = ~found.isfinite()
-    return found.masked_scatter(unseen, pixel_size(means[unseen], views, count)) if unseen.any() else found
+    if not unseen.any():
+        return found
+    largest = torch.cat([found[~unseen], found.new_zeros(1)]).max().item()
+    return found.masked_scatter(unseen, pixel_size(means[unseen], views, count, largest))
 
 
 def seen_pixel_size(means: Tensor, views: Sequence[Camera], near: float) -> Tensor:

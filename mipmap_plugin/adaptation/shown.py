@@ -34,6 +34,10 @@ LOOKED_AT, TOO_MANY = 16, 0.05
 # fills nearly all of a picture, unless it has such small units that the near plane keeps cameras farther away than a user's.
 LEAST_PIXELS, LEAST_SHARE = 16, 0.25
 
+# What fills fewer cells than a line of ACROSS of them, though it has CROWDED times as many splats, is a few things far apart. 95 objects,
+# captures and tiles of these fill 1,000 cells at least, and two rooms at a distance of a kilometer 14.
+ACROSS, CROWDED = 64, 16
+
 # How many splats are looked for in each round. Nearly every camera sees one of the first round's; only the others look for more.
 SAMPLES = 1 << 8, 1 << 14, 1 << 16
 
@@ -197,15 +201,30 @@ def too_small(views: Sequence[Camera], model: SplatModel, near: float, least: fl
     reach = (splats.means - center).norm(dim=1) + SEEN * splats.scales.abs().amax(1)
     width = 2 * float(reach.kthvalue(max(1, round(FRAMED * len(reach)))).values)
     middle = center.tolist()
-    most = max(width * view.fx / max(math.dist(view.center.tolist(), middle), near) for view in views)
+    away = [math.dist(view.center.tolist(), middle) for view in views]
+    most = max(width * view.fx / max(distance, near) for view, distance in zip(views, away, strict=True))
     if not most < least:
         return ""
     wrong = "the cameras seem to be in other units; give those of this scene"
-    if max(view.fx for view in views) * width / least < width / 2 + CLEAR * near:
+    wanted, allowed = max(view.fx for view in views) * width / least, width / 2 + CLEAR * near  # distances at which it is large, and is drawn whole
+    if width / 2 < wanted < allowed and min(away) < 2 * allowed:
         wrong = f"renderers of 3DGS draw nothing nearer than {near:g} units; {SCALE_UP}"
     elif len(splats) <= most**2:
         return ""
     return f"the scene is {units(width, 2)} units wide, and no view shows it larger than {units(most, 2)} px: {wrong}"
+
+
+def far_apart(means: Tensor) -> str:
+    """That the splats at `means` [N, 3] are a few things with nothing between them, in a sentence; "" if not. An orbit shows each as a speck."""
+    means = means[means.isfinite().all(dim=1)][:: 1 + len(means) // SAMPLES[-1]]
+    if len(means) <= CROWDED * ACROSS:
+        return ""
+    away = (means - means.median(dim=0).values).norm(dim=1)
+    radius = float(away.kthvalue(round(FRAMED * len(away))).values)
+    if not radius or len((means * (ACROSS / radius)).floor().unique(dim=0)) >= ACROSS:
+        return ""
+    where = f"the splats are a few things, {units(radius, 2)} units apart, which generated views show as specks"
+    return f"{where}: seen from nearer the file may look worse than its base; give the scene's cameras (--cameras), or a file of each thing"
 
 
 def orbited(source: Path | None, orbit: Orbit) -> str:
@@ -221,5 +240,6 @@ def remarks(views: Sequence[Camera], model: SplatModel, near: float, *, orbit: b
     """What is wrong with a scene in views that show something, in sentences. `near`: the near plane, in world units; `orbit`: they were generated."""
     least = LEAST_SHARE * min(views[0].size)
     least = least if orbit else min(LEAST_PIXELS, least)
-    found = too_near(views, places(model, views[0]), near), too_small(views, model, near, least)
+    means = places(model, views[0])
+    found = too_near(views, means, near), too_small(views, model, near, least), far_apart(means) if orbit else ""
     return [sentence for sentence in found if sentence]

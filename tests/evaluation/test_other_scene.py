@@ -51,6 +51,16 @@ def test_photographs_whose_cameras_are_given_too_are_told_of_once(tmp_path, caps
     assert "".join(capsys.readouterr().err.split()).count("theymaybeofanotherscene") == 1
 
 
+def test_photographs_of_one_color_are_no_other_scene():
+    """The mean of the others shows it exactly, and the base as well as 8 bits can tell."""
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(3))
+    base.model.parameters()["opacities"][:] = -4.0
+    blank = [SimpleNamespace(camera=camera, truth=lambda scale, protocol: torch.full((24, 32, 3), 0.0)) for camera in base.cameras]
+    assert doubt(base, blank).endswith("check --images")
+    base.model.parameters()["opacities"][:] = -9.0  # below 1/255
+    assert doubt(base, blank) == ""
+
+
 def test_a_base_is_compared_with_the_same_photographs_once(tmp_path, recwarn):
     """Not for their cameras, and again at every scale."""
     images = tiny.scene(tmp_path / "scene", tiny.cameras(4, seed=9, split="test"), tiny.cameras(4), seed=5)

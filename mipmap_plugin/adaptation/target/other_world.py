@@ -9,7 +9,8 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.curve import psnr_as_shown
+from mipmap_plugin.adaptation.curve import decibel, psnr_as_shown
+from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.camera import Camera, evenly
@@ -22,6 +23,9 @@ MOST_VIEWS, LOOK = 8, 128
 # Half turns of a world, by the signs of its axes. LichtFeld Studio turns that of a transforms file about y, of which its PLYs say nothing
 # (src/loader/formats/transforms.cpp, 0ff1dc2). About x and z it is what mixes up axes of OpenGL and OpenCV, and what is up and down.
 HALF_TURNS = {"y": (-1.0, 1.0, -1.0), "x": (1.0, -1.0, -1.0), "z": (-1.0, -1.0, 1.0)}
+
+# A base this close to photographs, in dB, differs from them by less than their 8 bits can tell, however close others come, as to one color.
+THE_SAME = decibel(INVISIBLE_ERROR)
 
 # How far poses of one place are apart: files of one capture have float32.
 SAME_POSE = 1e-5
@@ -65,7 +69,7 @@ def doubt_about(
         filled = [image + hole * (other - color) for image, hole, other, color in zip(images, empty, others, behind, strict=True)]
         return max(fmean(map(psnr_as_shown, each, truths)) for each in (images, filled))
 
-    if (found := by_base(cameras)) > by_others:
+    if (found := by_base(cameras)) > min(by_others, THE_SAME):
         return ""
     told = f"the base has {found:.1f} dB against the photographs, and the mean of the other photographs {by_others:.1f}"
     told = f"{told}: they may be of another scene, or their cameras in another frame; "

@@ -8,7 +8,7 @@ import tiny
 import torch
 from brief_runs import is_finite, shrunk
 
-from mipmap_plugin.adaptation.shown import remarks, worse_views
+from mipmap_plugin.adaptation.shown import far_apart, remarks, worse_views
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.wrap import wrap_model
 
@@ -92,6 +92,20 @@ def test_a_scene_in_small_units_is_told_of_where_the_near_plane_keeps_an_orbit_a
         wrap_model(shrunk(1e-4)).adapt(0.5, recipe="instant")
     with pytest.raises(SettingsError, match="the cameras seem to be in other units"):
         wrap_model(tiny.model(), cameras=moved_away(100.0)).adapt(0.5, recipe="instant")
+
+
+def test_things_far_apart_are_told_of_where_an_orbit_shows_them_as_specks():
+    room = 10 * torch.rand(2000, 3, generator=torch.Generator().manual_seed(0))
+    assert re.match(r"the splats are a few things, 1,\d+ units apart, ", far_apart(torch.cat([room, room + 1000])))
+    assert far_apart(room) == far_apart(torch.cat([room, room + 20])) == far_apart(room * 0) == far_apart(room[:5]) == ""
+
+
+def test_the_near_plane_is_not_blamed_where_it_keeps_no_camera_away():
+    """Scaled up with its cameras, such a scene would look the same: it is far away, or the lens is wide."""
+    far, wide = tiny.cameras(2), [replace(view, fx=1.0, fy=1.0) for view in tiny.cameras(2)]
+    for model, views in ((shrunk(0.02), far), (tiny.model(300), wide)):
+        with pytest.raises(SettingsError, match=r"no view shows it larger than \S+ px: the cameras seem to be in other units"):
+            wrap_model(model, cameras=views).adapt(0.5, recipe="instant")
 
 
 @pytest.mark.parametrize(("count", "spread"), [(1, 0.0), (5, 0.1)])

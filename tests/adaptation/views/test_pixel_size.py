@@ -27,8 +27,16 @@ def test_a_pixel_is_the_depth_over_the_focal_length():
 
 
 def test_a_pixel_is_that_of_the_closest_view_that_sees_the_splat():
-    means = torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 1.0], [30.0, 0.0, 4.0]])  # both see it; only the first does; none does
-    torch.testing.assert_close(pixel_size(means, [VIEW, CLOSER]), torch.tensor([2.0, 1.0, math.hypot(30, 2)]) / FOCAL)
+    means = torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 1.0], [1.5, 0.0, 0.5]])  # both see it; only the first does; none does
+    torch.testing.assert_close(pixel_size(means, [VIEW, CLOSER]), torch.tensor([2.0, 1.0, math.hypot(1.5, 0.5)]) / FOCAL)
+
+
+@pytest.mark.parametrize("size", [pixel_size, mean_pixel_size])
+def test_what_no_view_sees_has_no_larger_pixels_than_what_one_does(size):
+    """Else another room, a kilometer away, would become a blur."""
+    near, far = torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 1.0]]), torch.tensor([[1000.0, 0.0, 4.0]])
+    torch.testing.assert_close(size(torch.cat([near, far]), [VIEW]), torch.tensor([4.0, 1.0, 4.0]) / FOCAL)
+    torch.testing.assert_close(size(far, [VIEW]), torch.tensor([math.hypot(1000, 4)]) / FOCAL)
 
 
 def test_a_broken_numba_leaves_it_to_torch(monkeypatch):
@@ -57,10 +65,10 @@ def test_a_pixel_has_a_size_in_the_plane_of_the_camera_too():
 
 def test_the_mean_pixel_is_that_of_least_squares_in_the_pixels_of_the_views():
     """Depths of 4 and 2, focal length 40: variances of c px² there are c/100 and c/400, and that of both is c/340."""
-    means = torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 1.0], [30.0, 0.0, 4.0]])  # both see it; only the first does; none does
+    means = torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 1.0], [1.5, 0.0, 0.5]])  # both see it; only the first does; none does
     found = mean_pixel_size(means, [VIEW, CLOSER])
     torch.testing.assert_close(found[0].square(), torch.tensor(1 / 340))
-    torch.testing.assert_close(found[1:], pixel_size(means[1:], [VIEW, CLOSER]))
+    torch.testing.assert_close(found[1:], pixel_size(means, [VIEW, CLOSER])[1:])
 
 
 @pytest.mark.parametrize("unit", [1e-12, 1e12])
