@@ -54,11 +54,11 @@ def test_photographs_whose_cameras_are_given_too_are_told_of_once(tmp_path, caps
 def test_photographs_of_one_color_are_no_other_scene():
     """The mean of the others shows it exactly, and the base as well as 8 bits can tell."""
     base = wrap_model(tiny.model(), cameras=tiny.cameras(3))
-    base.model.parameters()["opacities"][:] = -4.0
-    blank = [SimpleNamespace(camera=camera, truth=lambda scale, protocol: torch.full((24, 32, 3), 0.0)) for camera in base.cameras]
-    assert doubt(base, blank).endswith("check --images")
+    blank = [JudgedView(camera, torch.zeros(24, 32, 3), Path("photograph.png")) for camera in base.cameras]
     base.model.parameters()["opacities"][:] = -9.0  # below 1/255
-    assert doubt(base, blank) == ""
+    assert of_another_scene(base, blank) == ""
+    base.model.parameters()["opacities"][:] = -4.0
+    assert of_another_scene(base, blank).endswith("check --images")
 
 
 def test_a_base_is_compared_with_the_same_photographs_once(tmp_path, recwarn):

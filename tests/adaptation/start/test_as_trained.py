@@ -59,7 +59,7 @@ def test_merged_splats_keep_their_shapes_where_the_filter_alone_is_better(monkey
     base, antialiased = wrapped("antialiased", 0.3), Effects(0, "antialiased")
     config = base.adapt(1 / 4, recipe="instant").report.settings.model_copy(update={"merge_to": 0.5, "steps": steps})
     problem = candidates.StartProblem(
-        Splats, base.cameras, base.cameras, 1 / 4, antialiased, antialiased, config, ReferenceBackend(), True,
+        Splats, base.cameras, base.cameras, 1 / 4, antialiased, antialiased, config, ReferenceBackend(), False,
         lambda model: Quality(*[30.0 if model not in reshaped else formed_db] * 2), lambda _: torch.no_grad(),
     )  # fmt: skip
     monkeypatch.setattr(candidates.BaseWeights, "measured", lambda *_: torch.ones(100))
