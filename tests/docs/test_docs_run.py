@@ -3,7 +3,6 @@
 import ast
 import builtins
 import importlib
-import inspect
 import os
 import shlex
 import shutil
@@ -12,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import tiny
-from docs_pages import CALLS, COMMANDS, PYTHON, Piece, is_mention
+from docs_pages import CALLS, PYTHON, Piece, is_mention, options
 
 from mipmap_plugin import cli, wrap_model
 from mipmap_plugin.formats.splat_transform import find_tool
@@ -78,6 +77,22 @@ def runs(call: Piece) -> bool:
     return not is_mention(words) and not NOT_RUN.keys() & set(words)
 
 
+RUN = [call for call in CALLS if runs(call)]
+
+
+def shortened(words: list[str]) -> list[str]:
+    """A command with as few steps and repetitions as there can be, which may replace what another one wrote."""
+    known = options(words[0])
+    for name, least in {"steps": "3", "repeats": "1"}.items():
+        words = [*words, f"--{name}", least] if name in known and f"--{name}" not in words else words
+    return [*words, "--overwrite"] if "overwrite" in known else words
+
+
+def test_every_command_that_takes_steps_takes_few():
+    shown = {words[0]: shortened(words) for words in (shlex.split(call.text)[1:] for call in RUN)}
+    assert {name for name, words in shown.items() if "--steps" in words} == {"adapt", "levels", "evaluate", "tradeoff"}
+
+
 @pytest.fixture(scope="module")
 def demo_scene(tmp_path_factory):
     """What the commands name, made of the embedded scene: checkpoints, cameras, and photographs, which the base itself shows."""
@@ -101,10 +116,10 @@ def demo_scene(tmp_path_factory):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("brief_ladders")
-@pytest.mark.parametrize("call", [call for call in CALLS if runs(call)], ids=str)
+@pytest.mark.parametrize("call", RUN, ids=str)
 def test_commands_run(call, demo_scene, tmp_path, monkeypatch, capsys, request):
-    """As they are written, but for as few steps, views and repetitions as there can be, and with a folder for each `DIR`."""
-    if not {"--jobs", "--dask", "--tiles"} & set(call.text.split()):
+    """As they are written, but `shortened` and in few views, and with a folder for each `DIR`."""
+    if not {"--jobs", "--dask"} & set(call.text.split()):
         request.getfixturevalue("few_views")  # of this process alone
     if "tradeoff" in call.text:
         pytest.importorskip("matplotlib")
@@ -115,11 +130,7 @@ def test_commands_run(call, demo_scene, tmp_path, monkeypatch, capsys, request):
     for place, word in enumerate(words):
         if word == "DIR":
             words[place] = "images" if words[place - 1] == "--images" else str(tmp_path / "results")
-    for extra in (["--steps", "3"], ["--repeats", "1"]):
-        if extra[0][2:] in inspect.signature(COMMANDS[words[0]]).parameters and extra[0] not in words:
-            words += extra
-    words += ["--overwrite"] if "overwrite" in inspect.signature(COMMANDS[words[0]]).parameters else []
-    assert cli.main(words) == 0, capsys.readouterr().err
+    assert cli.main(shortened(words)) == 0, capsys.readouterr().err
 
 
 @pytest.mark.slow
