@@ -1,13 +1,9 @@
-"""What README.md and docs/ show runs: their Python on a scene that adapts in a moment, their commands on the embedded one."""
+"""What README.md and docs/ show runs, Python and commands, on scenes that adapt in a moment."""
 
 import ast
 import builtins
 import importlib
-import os
 import shlex
-import shutil
-from importlib.resources import files
-from pathlib import Path
 
 import pytest
 import tiny
@@ -16,6 +12,7 @@ from docs_pages import CALLS, PYTHON, Piece, is_mention, options
 from mipmap_plugin import cli, wrap_model
 from mipmap_plugin.formats.splat_transform import find_tool
 from mipmap_plugin.recipes import DEFAULT_OUT
+from mipmap_plugin.scenes import write_cameras
 
 
 def unresolved(code: str) -> list[str]:
@@ -33,12 +30,8 @@ def unresolved(code: str) -> list[str]:
     return absent + [node.id for node in names if isinstance(node.ctx, ast.Load) and node.id not in known]
 
 
-# A ladder of levels takes half a minute.
-LONG = [pytest.param(piece, marks=[pytest.mark.slow] if ".levels(" in piece.text else []) for piece in PYTHON]
-
-
-@pytest.mark.parametrize("piece", LONG, ids=str)
-@pytest.mark.usefixtures("few_views")
+@pytest.mark.parametrize("piece", PYTHON, ids=str)
+@pytest.mark.usefixtures("few_views", "brief_ladders")
 def test_python_runs(piece, tmp_path, monkeypatch):
     """On a scene that adapts in a moment, in place of the reader's; a time budget has room for no more steps than usual."""
     assert unresolved(piece.text) == []
@@ -53,7 +46,7 @@ def test_a_wrong_name_is_found():
     assert unresolved("from mipmap_plugin import wrap_model, wrap_it\nprint(wrap_model, modle)") == ["wrap_it", "modle"]
 
 
-# What runs, on the scene that comes along
+# The commands
 
 NOT_RUN = {
     "view": "serves a page until Ctrl-C; tests/browser/test_live_view.py",
@@ -79,6 +72,9 @@ def runs(call: Piece) -> bool:
 
 RUN = [call for call in CALLS if runs(call)]
 
+# What takes more than a second or two: ladders, measurements, all checks of a backend, and processes that load torch.
+LONG = {"levels", "evaluate", "tradeoff", "backends", "--jobs", "--dask"}
+
 
 def shortened(words: list[str]) -> list[str]:
     """A command with as few steps and repetitions as there can be, which may replace what another one wrote."""
@@ -94,30 +90,26 @@ def test_every_command_that_takes_steps_takes_few():
 
 
 @pytest.fixture(scope="module")
-def demo_scene(tmp_path_factory):
-    """What the commands name, made of the embedded scene: checkpoints, cameras, and photographs, which the base itself shows."""
-    home, here = Path(str(files("mipmap_plugin.demo"))), tmp_path_factory.mktemp("scene")
+def small_scene(tmp_path_factory):
+    """What the commands name: checkpoints, cameras, and photographs, which the base itself shows."""
+    here = tmp_path_factory.mktemp("scene")
+    views = tiny.cameras(6) + tiny.cameras(3, seed=9, split="test")
     for name in FOLDERS:
-        ply = here / name / "point_cloud/iteration_30000/point_cloud.ply"
-        ply.parent.mkdir(parents=True)
-        shutil.copy(home / "base.ply", ply)
-        shutil.copy(home / "cameras.json", here / name)
-        (here / name / "cfg_args").write_text("Namespace(sh_degree=3, resolution=-1, white_background=True, eval=True)")
+        tiny.folder(here / name, views)
+        (here / name / "cfg_args").write_text("Namespace(sh_degree=1, resolution=-1, white_background=True, eval=True)")
     for name in FILES:
-        shutil.copy(home / "base.ply", here / name)
+        tiny.ply(here / name)
     (here / "data/bicycle").mkdir(parents=True)
-    shutil.copy(home / "cameras.json", here / "data/bicycle")
+    write_cameras(here / "data/bicycle/cameras.json", views)
+    base = wrap_model(here / FOLDERS[0])
     for name in ("images", "lego"):
-        base = wrap_model(here / FOLDERS[0])
-        views = [view for view in base.cameras if view.split == "test"][:3]
-        tiny.write_photographs(here / name, "test", views, lambda view, base=base: base.render(view).image)
+        tiny.write_photographs(here / name, "test", [view for view in base.cameras if view.split == "test"], lambda view: base.render(view).image)
     return here
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("brief_ladders")
-@pytest.mark.parametrize("call", RUN, ids=str)
-def test_commands_run(call, demo_scene, tmp_path, monkeypatch, capsys, request):
+@pytest.mark.parametrize("call", [pytest.param(call, marks=[pytest.mark.slow] if LONG & set(call.text.split()) else []) for call in RUN], ids=str)
+def test_commands_run(call, small_scene, tmp_path, monkeypatch, capsys, request):
     """As they are written, but `shortened` and in few views, and with a folder for each `DIR`."""
     if not {"--jobs", "--dask"} & set(call.text.split()):
         request.getfixturevalue("few_views")  # of this process alone
@@ -125,18 +117,9 @@ def test_commands_run(call, demo_scene, tmp_path, monkeypatch, capsys, request):
         pytest.importorskip("matplotlib")
     if {"--streamed-sog", "--tiles"} & set(call.text.split()) and "levels" in call.text and find_tool() is None:
         pytest.skip("splat-transform is not installed")
-    monkeypatch.chdir(demo_scene)
+    monkeypatch.chdir(small_scene)
     words = shlex.split(call.text)[1:]
     for place, word in enumerate(words):
         if word == "DIR":
             words[place] = "images" if words[place - 1] == "--images" else str(tmp_path / "results")
     assert cli.main(shortened(words)) == 0, capsys.readouterr().err
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("piece", PYTHON, ids=str)
-def test_python_runs_on_the_embedded_scene(piece, demo_scene, tmp_path, monkeypatch):
-    os.makedirs(tmp_path / "output")
-    shutil.copytree(demo_scene / "output/bicycle", tmp_path / "output/bicycle")
-    monkeypatch.chdir(tmp_path)
-    exec(compile(piece.text, str(piece), "exec"), {"__name__": "block"})
