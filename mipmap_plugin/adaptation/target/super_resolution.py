@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-import zipfile
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +16,7 @@ from mipmap_plugin.adaptation.target.disk_cache import cached, fingerprint
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError, brief, install
 from mipmap_plugin.formats.atomic import sha256
+from mipmap_plugin.formats.magic import archive, is_archive
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.formats.torchscript import read_torchscript
 from mipmap_plugin.process.torchvision_absent import torchvision_optional
@@ -97,10 +97,10 @@ def _weights(path: Path) -> Any:
 
 
 def _is_torchscript(path: Path) -> bool:
-    if not zipfile.is_zipfile(path):
+    if not is_archive(path):
         return False
-    with zipfile.ZipFile(path) as archive:
-        return any(name.endswith("/constants.pkl") for name in archive.namelist())
+    with archive(path) as opened:
+        return any(name.endswith("/constants.pkl") for name in opened.namelist())
 
 
 def _in_tiles(network: Any, image: Tensor) -> Tensor:

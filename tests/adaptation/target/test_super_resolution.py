@@ -83,10 +83,12 @@ def test_what_is_no_enlarging_network_is_refused_in_a_sentence(spandrel, network
     torch.save({"weights": Hostile()}, tmp_path / "hostile.pth")
     torch.save({"weights": torch.zeros(3)}, tmp_path / "other.pth")
     (tmp_path / "text.safetensors").write_text("no tensors")
+    (tmp_path / "spoiled.pth").write_bytes((tmp_path / "other.pth").read_bytes().replace(b"PK\x01\x02", b"PK\x01\x03"))  # its list of contents
     for name, sentence in {
         "hostile.pth": "is not executed",
         "other.pth": "not a network that spandrel supports",
         "text.safetensors": "is damaged; download it again",
+        "spoiled.pth": "is a damaged zip archive",
     }.items():
         with pytest.raises(CheckpointError, match=sentence):
             Network(tmp_path / name)
