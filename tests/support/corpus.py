@@ -85,6 +85,11 @@ def open_exchange(path: Path) -> None:
             raise
 
 
+def open_network(path: Path) -> None:
+    """The weights of an upsampler, of which spandrel makes a network."""
+    super_resolution._weights(path)
+
+
 def _quick_run(state: Path) -> Adapted:
     model = wrap_model(tiny.model(8), cameras=tiny.cameras(2, width=8, height=6), backend="reference")
     return model.adapt(1 / 2, steps=2, extra_views=0, views_per_step=1, resume=state)
@@ -273,7 +278,7 @@ SAMPLES: dict[str, Sample] = {
     "dataparser_transforms.json": Sample(_placed_splatfacto, "dataparser_transforms.json", ("of_json", *TEXT), open=open_placed),
     "state of a run": Sample(_state, "state", BINARY, open=open_state),
     "state dict of a network": Sample(_network, "net.pth", TORCH, open=lambda path: read_state_dict(path) and None),
-    "weights of an upsampler": Sample(_network, "net.pth", TORCH, open=lambda path: super_resolution._weights(path) and None),
+    "weights of an upsampler": Sample(_network, "net.pth", TORCH, open=open_network),
     "png": Sample(_pictures("PNG", "RGBA"), PICTURE, PICTURES, open=open_images),
     "png, 16 bits": Sample(_pictures("PNG", "I;16"), PICTURE, PICTURES, open=open_images),
     "png, palette": Sample(_pictures("PNG", "P"), PICTURE, PICTURES, open=open_images),

@@ -62,11 +62,11 @@ def _load(path: Path) -> Any:
             import spandrel
         except ImportError as error:
             raise PluginError(f"{path}: spandrel is needed to load a super-resolution network; {INSTALL} ({error})") from error
+    weights = _weights(path)
     try:
-        weights = spandrel.canonicalize_state_dict(_weights(path))
         with _quietly():
-            network = spandrel.ModelLoader().load_from_state_dict(weights)
-    except (spandrel.UnsupportedModelError, RuntimeError, AttributeError, KeyError, TypeError) as error:
+            network = spandrel.ModelLoader().load_from_state_dict(spandrel.canonicalize_state_dict(weights))
+    except Exception as error:  # it concludes from shapes what a network is, and fails in any way where these are odd
         raise CheckpointError(f"{path}: not a network that spandrel supports ({brief(error)})") from error
     if not isinstance(network, spandrel.ImageModelDescriptor) or (network.input_channels, network.output_channels) != (3, 3):
         raise SettingsError(f"{path}: {network.architecture.name} does not turn one RGB image into another; give a super-resolution network")
