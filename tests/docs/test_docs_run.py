@@ -8,6 +8,7 @@ import shlex
 import pytest
 import tiny
 from docs_pages import CALLS, PYTHON, Piece, is_mention, options
+from torch_checkpoints import gsplat_folder, splatfacto_folder, splats
 
 from mipmap_plugin import cli, wrap_model
 from mipmap_plugin.formats.splat_transform import find_tool
@@ -56,13 +57,11 @@ NOT_RUN = {
     "phone.spz": "splat-transform may not be installed",
     "SwinIR_x2.pth": "no network comes along",
     "FILE": "no weights come along",
-    "results/garden": "no checkpoint of gsplat comes along",
-    "scenes.txt": "no list comes along",
     "tcp://scheduler:8786": "no scheduler runs here",
-    "outputs/poster/splatfacto/2026-11-01_120000": "no checkpoint of splatfacto comes along",
 }
 FOLDERS = ("CHECKPOINT", "output/bicycle", "output/city", "lego_200")
 FILES = ("scene.ply", "point_cloud.ply")
+SPLATS = 70  # enough for 64 tiles
 
 
 def runs(call: Piece) -> bool:
@@ -95,12 +94,17 @@ def small_scene(tmp_path_factory):
     here = tmp_path_factory.mktemp("scene")
     views = tiny.cameras(6) + tiny.cameras(3, seed=9, split="test")
     for name in FOLDERS:
-        tiny.folder(here / name, views)
+        tiny.folder(here / name, views, count=SPLATS)
         (here / name / "cfg_args").write_text("Namespace(sh_degree=1, resolution=-1, white_background=True, eval=True)")
     for name in FILES:
         tiny.ply(here / name)
-    (here / "data/bicycle").mkdir(parents=True)
-    write_cameras(here / "data/bicycle/cameras.json", views)
+    (here / "scenes.txt").write_text("output/bicycle\nlego_200\n")
+    gsplat_folder(here / "results/garden", splats(), normalized="false")
+    run = splatfacto_folder(here / "outputs/poster/splatfacto/2026-11-01_120000", splats())
+    (run / "dataparser_transforms.json").write_text('{"scale": 1, "transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}')
+    for name in ("bicycle", "garden", "poster"):
+        (here / "data" / name).mkdir(parents=True)
+        write_cameras(here / "data" / name / "cameras.json", views)
     base = wrap_model(here / FOLDERS[0])
     for name in ("images", "lego"):
         tiny.write_photographs(here / name, "test", [view for view in base.cameras if view.split == "test"], lambda view: base.render(view).image)
