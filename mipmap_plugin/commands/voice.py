@@ -6,6 +6,7 @@ import contextlib
 import errno
 import io
 import os
+import re
 import shutil
 import sys
 import textwrap
@@ -21,6 +22,9 @@ from mipmap_plugin.errors import OutputError, SettingsError
 
 # The word before a command that the user may run next, and what stands for the command's spaces while the lines around it are wrapped.
 NEXT, UNBROKEN = "next: ", "\0"
+
+# What a terminal carries out instead of showing it, but for tabs and line breaks. Names in a file, of columns or views, may hold it, and are told.
+CONTROL = re.compile(r"[\0-\x08\x0b-\x1f\x7f-\x9f]")
 
 # The fewest columns that are left for a text after its indentation.
 LEAST_WIDTH = 20
@@ -50,10 +54,15 @@ VOICE: ContextVar[Voice] = ContextVar("VOICE", default=Voice())  # noqa: B039  a
 
 def say(text: str, hanging: int | None = None) -> None:
     """Print `text` unless the command is quiet; also write it to the log. `hanging`: on a terminal, wrap it, with further lines indented so far."""
-    voice = VOICE.get()
+    voice, text = VOICE.get(), harmless(text)
     voice.write(text)
     if not voice.quiet:
         put(text if hanging is None or not voice.out.isatty() else wrapped(text, hanging, shutil.get_terminal_size().columns))
+
+
+def harmless(text: str) -> str:
+    """The text with what a terminal would carry out as Python writes it, such as \\x1b."""
+    return CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
 def wrapped(text: str, hanging: int, width: int) -> str:
@@ -82,12 +91,13 @@ def put(text: str) -> None:
 
 def detail(text: str) -> None:
     """Write what few people need to the log only."""
-    VOICE.get().write(text)
+    VOICE.get().write(harmless(text))
 
 
 def note(text: str, *, urgent: bool = False) -> None:
     """Print a line about work that goes on to standard error, above its bars, unless the command is quiet and it is not `urgent`; also write it to
     the log."""
+    text = harmless(text)
     VOICE.get().write(text)
     if urgent or not VOICE.get().quiet:
         with contextlib.suppress(OSError):  # who reads it may have gone
@@ -96,6 +106,7 @@ def note(text: str, *, urgent: bool = False) -> None:
 
 def complain(text: str) -> None:
     """Print why a command ends on standard error, quiet or not; also write it to the log."""
+    text = harmless(text)
     VOICE.get().write(text.strip())
     with contextlib.suppress(OSError):  # the exit code says it too
         print(text, file=sys.stderr)

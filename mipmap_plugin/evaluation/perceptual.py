@@ -67,7 +67,7 @@ def _load(backbone: str, file: Path | None) -> nn.Module:
     torchvision_names = {name: "features." + name.split(".", 1)[1] for name in network.net.state_dict()}  # lpips: slice1.0.weight
     try:
         network.net.load_state_dict({name: weights[torchvision_name] for name, torchvision_name in torchvision_names.items()})
-    except (KeyError, TypeError, RuntimeError) as error:
+    except (LookupError, TypeError, RuntimeError) as error:
         where, advice = (file, "leave it out to download one") if file else (_kept(backbone), AGAIN)
         raise CheckpointError(f"{where} holds no {backbone} backbone as torchvision saves it; {advice}") from error
     measure: nn.Module = network

@@ -79,7 +79,7 @@ def kind_of(path: Path) -> str:
 
 def pickle_of(path: Path) -> bytes:
     """The first bytes of a torch file's pickle, for searching only; empty if it has none. Raises CheckpointError."""
-    if not zipfile.is_zipfile(path):
+    if not is_archive(path):
         return read_head(path, MAX_PICKLE)
     with archive(path) as opened:
         pickles = [name for name in opened.namelist() if name.endswith("data.pkl")]
@@ -113,6 +113,14 @@ def _kind_of_json(head: bytes) -> str:
     if b'"asset"' in head and any(name in head for name in (b'"bufferViews"', b'"accessors"', b'"nodes"')):
         return "glb"
     return "gsplat-png" if all(name in head for name in (b'"means"', b'"shape"', b'"mins"', b'"quats"')) else "unknown"
+
+
+def is_archive(path: Path) -> bool:
+    """Whether a file is a zip archive, which may be damaged (`archive`)."""
+    try:
+        return zipfile.is_zipfile(path)
+    except zipfile.BadZipFile:  # its last bytes say that it is one of several parts
+        return True
 
 
 @contextmanager

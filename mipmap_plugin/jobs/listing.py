@@ -23,11 +23,13 @@ def read_list(path: Path) -> list[Path]:
     try:
         refuse_named_pipe(path)
         content = path.read_bytes()
-        lines = content.decode("utf-16" if content.startswith(UTF_16) else "utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        text = content.decode("utf-16" if content.startswith(UTF_16) else "utf-8-sig")
+        if "\0" in text:  # which no name has: it is UTF-16 that does not begin so
+            raise UnicodeError
+    except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise SettingsError(f"{path}: {reason}; --list takes a text file with a checkpoint on each line") from None
-    found = [Path(text) for line in lines if (text := line.partition("#")[0].strip())]
+    found = [Path(name) for line in text.splitlines() if (name := line.partition("#")[0].strip())]
     if not found:
         raise SettingsError(f"{path} lists no checkpoint; write one on each line")
     return found

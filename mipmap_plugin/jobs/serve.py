@@ -13,6 +13,7 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from contextlib import redirect_stderr
 from typing import IO
 
@@ -50,8 +51,11 @@ def _read(stream: IO[bytes], requests: queue.SimpleQueue[Request]) -> None:
     try:
         while True:
             requests.put(pickle.load(stream))
-    except EOFError:
+    except (EOFError, pickle.UnpicklingError):  # the owner is gone, perhaps in the middle of a job
         os._exit(0)
+    except Exception:  # this package was replaced by another version since the owner began; who waits for an outcome has to learn it
+        traceback.print_exc()
+        os._exit(1)
 
 
 def _leave(number: int, frame: object) -> None:

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 from mipmap_plugin.errors import TEMPORARY, CheckpointError, warn
-from mipmap_plugin.formats.magic import archive
+from mipmap_plugin.formats.magic import archive, is_archive
 from mipmap_plugin.formats.zipped import copied, only_ply, refuse_large
 from mipmap_plugin.models.places import PARTS
 
@@ -25,7 +25,7 @@ _LOCK = threading.Lock()
 
 def opened(path: Path) -> Path:
     """The unpacked model folder of a zip archive that holds one; `path` itself if it is anything else. Raises CheckpointError."""
-    if not (path.is_file() and zipfile.is_zipfile(path)) or (root := _root(path)) is None:
+    if not (path.is_file() and is_archive(path)) or (root := _root(path)) is None:
         return path
     state = path.stat()
     with _LOCK:

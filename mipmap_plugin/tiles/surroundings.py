@@ -15,6 +15,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.optimization.activation import WithGradients
 from mipmap_plugin.adaptation.parallel import VIEWS_AT_ONCE
 from mipmap_plugin.adaptation.renderers import Comparison, SteppingRenderer
 from mipmap_plugin.adaptation.target.image_store import from_16_bits
@@ -136,7 +137,7 @@ class _InHalo(SteppingRenderer):
         image, alpha = core.image.requires_grad_(), core.alpha.requires_grad_()
         whole = self.around.whole(camera, core)
         [(gradient, square_error)] = compare([number], [whole.detach()])
-        whole.backward(gradient)
+        WithGradients.apply([gradient], whole).backward()  # type: ignore[no-untyped-call]  # torch's
         assert image.grad is not None  # since the whole contains it
         stepper.differentiate(number, image.grad, alpha.grad)
         return square_error

@@ -40,6 +40,17 @@ def test_a_quiet_command_prints_nothing(base, tmp_path, capsys, words):
     assert capsys.readouterr() == ("", "")
 
 
+def test_a_file_does_not_command_the_terminal(base, tmp_path, capsys):
+    """By escape sequences in its names, which it may have from anybody."""
+    cameras = Path(base, "cameras.json")
+    cameras.write_text(cameras.read_text().replace("view_0", "view\\u001b[2J\\u009b2J"))
+    assert main(["render", base, "--view", "nothing", "--output", str(tmp_path / "out")]) == 2
+    Path(tmp_path, "a.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float \x1b[2J\nend_header\n1\n")
+    assert main(["inspect", str(tmp_path / "a.ply"), "--log", str(tmp_path / "log")]) == 2
+    told = capsys.readouterr().err
+    assert r"view\x1b[2J\x9b2J" in told and r"(columns \x1b[2J)" in told and not set("\x1b\x9b") & set(told + (tmp_path / "log").read_text())
+
+
 def test_what_is_said_reaches_a_pipe_at_once(tmp_path):
     pipe = (tmp_path / "pipe").open("w")
     with pipe, contextlib.redirect_stdout(pipe):

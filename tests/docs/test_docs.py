@@ -9,14 +9,12 @@ from importlib.resources import files
 from pathlib import Path
 
 import pytest
-from docs_pages import CALLS, COMMANDS, PAGES, ROOT, SHELL, SNIPPET, Piece, blocks, is_mention, prose
+from docs_pages import CALLS, COMMANDS, PAGES, ROOT, SHELL, SNIPPET, Piece, blocks, is_mention, options, prose
 
 import mipmap_plugin
 from mipmap_plugin import cli, wrap_model
 from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS
 from mipmap_plugin.backends import BACKENDS
-from mipmap_plugin.commands.adapt import Changes
-from mipmap_plugin.commands.many import Many
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import explain
 from mipmap_plugin.models.families import BUILT_IN
@@ -149,16 +147,15 @@ def test_there_are_commands_to_check():
     assert len(COMMANDS) == 10 and {shlex.split(call.text)[1] for call in CALLS} >= set(COMMANDS)
 
 
-def options() -> set[str]:
-    """Those of all commands."""
-    parameters = {name for command in COMMANDS.values() for name in inspect.signature(command).parameters} | set(vars(Many())) | set(vars(Changes()))
-    names = {name.replace("_", "-") for name in parameters}
+def options_of_all() -> set[str]:
+    """Those of all commands, as they are typed."""
+    names = {name.replace("_", "-") for command in COMMANDS for name in options(command)}
     return {f"--{name}" for name in names} | {f"--no-{name}" for name in names} | {"--help", "--version", "--quiet", "--log"}
 
 
 def test_options_exist():
     ours = [piece for piece in SHELL if piece.text.split()[0] not in OTHER_PROGRAMS]
-    absent = [(str(piece), each) for piece in ours for each in OPTION.findall(piece.text) if each not in options() | OPTIONS_OF_OTHERS]
+    absent = [(str(piece), each) for piece in ours for each in OPTION.findall(piece.text) if each not in options_of_all() | OPTIONS_OF_OTHERS]
     assert absent == []
 
 

@@ -1,22 +1,19 @@
-"""What README.md and docs/ show runs: their Python on a scene that adapts in a moment, their commands on the embedded one."""
+"""What README.md and docs/ show runs, Python and commands, on scenes that adapt in a moment."""
 
 import ast
 import builtins
 import importlib
-import inspect
-import os
 import shlex
-import shutil
-from importlib.resources import files
-from pathlib import Path
 
 import pytest
 import tiny
-from docs_pages import CALLS, COMMANDS, PYTHON, Piece, is_mention
+from docs_pages import CALLS, PYTHON, Piece, is_mention, options
+from torch_checkpoints import gsplat_folder, splatfacto_folder, splats
 
 from mipmap_plugin import cli, wrap_model
 from mipmap_plugin.formats.splat_transform import find_tool
 from mipmap_plugin.recipes import DEFAULT_OUT
+from mipmap_plugin.scenes import write_cameras
 
 
 def unresolved(code: str) -> list[str]:
@@ -34,12 +31,8 @@ def unresolved(code: str) -> list[str]:
     return absent + [node.id for node in names if isinstance(node.ctx, ast.Load) and node.id not in known]
 
 
-# A ladder of levels takes half a minute.
-LONG = [pytest.param(piece, marks=[pytest.mark.slow] if ".levels(" in piece.text else []) for piece in PYTHON]
-
-
-@pytest.mark.parametrize("piece", LONG, ids=str)
-@pytest.mark.usefixtures("few_views")
+@pytest.mark.parametrize("piece", PYTHON, ids=str)
+@pytest.mark.usefixtures("few_views", "brief_ladders")
 def test_python_runs(piece, tmp_path, monkeypatch):
     """On a scene that adapts in a moment, in place of the reader's; a time budget has room for no more steps than usual."""
     assert unresolved(piece.text) == []
@@ -54,7 +47,7 @@ def test_a_wrong_name_is_found():
     assert unresolved("from mipmap_plugin import wrap_model, wrap_it\nprint(wrap_model, modle)") == ["wrap_it", "modle"]
 
 
-# What runs, on the scene that comes along
+# The commands
 
 NOT_RUN = {
     "view": "serves a page until Ctrl-C; tests/browser/test_live_view.py",
@@ -64,13 +57,11 @@ NOT_RUN = {
     "phone.spz": "splat-transform may not be installed",
     "SwinIR_x2.pth": "no network comes along",
     "FILE": "no weights come along",
-    "results/garden": "no checkpoint of gsplat comes along",
-    "scenes.txt": "no list comes along",
     "tcp://scheduler:8786": "no scheduler runs here",
-    "outputs/poster/splatfacto/2026-11-01_120000": "no checkpoint of splatfacto comes along",
 }
 FOLDERS = ("CHECKPOINT", "output/bicycle", "output/city", "lego_200")
 FILES = ("scene.ply", "point_cloud.ply")
+SPLATS = 70  # enough for 64 tiles
 
 
 def runs(call: Piece) -> bool:
@@ -78,54 +69,61 @@ def runs(call: Piece) -> bool:
     return not is_mention(words) and not NOT_RUN.keys() & set(words)
 
 
+RUN = [call for call in CALLS if runs(call)]
+
+# What takes more than a second or two: ladders, measurements, all checks of a backend, and processes that load torch.
+LONG = {"levels", "evaluate", "tradeoff", "backends", "--jobs", "--dask"}
+
+
+def shortened(words: list[str]) -> list[str]:
+    """A command with as few steps and repetitions as there can be, which may replace what another one wrote."""
+    known = options(words[0])
+    for name, least in {"steps": "3", "repeats": "1"}.items():
+        words = [*words, f"--{name}", least] if name in known and f"--{name}" not in words else words
+    return [*words, "--overwrite"] if "overwrite" in known else words
+
+
+def test_every_command_that_takes_steps_takes_few():
+    shown = {words[0]: shortened(words) for words in (shlex.split(call.text)[1:] for call in RUN)}
+    assert {name for name, words in shown.items() if "--steps" in words} == {"adapt", "levels", "evaluate", "tradeoff"}
+
+
 @pytest.fixture(scope="module")
-def demo_scene(tmp_path_factory):
-    """What the commands name, made of the embedded scene: checkpoints, cameras, and photographs, which the base itself shows."""
-    home, here = Path(str(files("mipmap_plugin.demo"))), tmp_path_factory.mktemp("scene")
+def small_scene(tmp_path_factory):
+    """What the commands name: checkpoints, cameras, and photographs, which the base itself shows."""
+    here = tmp_path_factory.mktemp("scene")
+    views = tiny.cameras(6) + tiny.cameras(3, seed=9, split="test")
     for name in FOLDERS:
-        ply = here / name / "point_cloud/iteration_30000/point_cloud.ply"
-        ply.parent.mkdir(parents=True)
-        shutil.copy(home / "base.ply", ply)
-        shutil.copy(home / "cameras.json", here / name)
-        (here / name / "cfg_args").write_text("Namespace(sh_degree=3, resolution=-1, white_background=True, eval=True)")
+        tiny.folder(here / name, views, count=SPLATS)
+        (here / name / "cfg_args").write_text("Namespace(sh_degree=1, resolution=-1, white_background=True, eval=True)")
     for name in FILES:
-        shutil.copy(home / "base.ply", here / name)
-    (here / "data/bicycle").mkdir(parents=True)
-    shutil.copy(home / "cameras.json", here / "data/bicycle")
+        tiny.ply(here / name)
+    (here / "scenes.txt").write_text("output/bicycle\nlego_200\n")
+    gsplat_folder(here / "results/garden", splats(), normalized="false")
+    run = splatfacto_folder(here / "outputs/poster/splatfacto/2026-11-01_120000", splats())
+    (run / "dataparser_transforms.json").write_text('{"scale": 1, "transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}')
+    for name in ("bicycle", "garden", "poster"):
+        (here / "data" / name).mkdir(parents=True)
+        write_cameras(here / "data" / name / "cameras.json", views)
+    base = wrap_model(here / FOLDERS[0])
     for name in ("images", "lego"):
-        base = wrap_model(here / FOLDERS[0])
-        views = [view for view in base.cameras if view.split == "test"][:3]
-        tiny.write_photographs(here / name, "test", views, lambda view, base=base: base.render(view).image)
+        tiny.write_photographs(here / name, "test", [view for view in base.cameras if view.split == "test"], lambda view: base.render(view).image)
     return here
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("brief_ladders")
-@pytest.mark.parametrize("call", [call for call in CALLS if runs(call)], ids=str)
-def test_commands_run(call, demo_scene, tmp_path, monkeypatch, capsys, request):
-    """As they are written, but for as few steps, views and repetitions as there can be, and with a folder for each `DIR`."""
-    if not {"--jobs", "--dask", "--tiles"} & set(call.text.split()):
+@pytest.mark.parametrize("call", [pytest.param(call, marks=[pytest.mark.slow] if LONG & set(call.text.split()) else []) for call in RUN], ids=str)
+def test_commands_run(call, small_scene, tmp_path, monkeypatch, capsys, request):
+    """As they are written, but `shortened` and in few views, and with a folder for each `DIR`."""
+    if not {"--jobs", "--dask"} & set(call.text.split()):
         request.getfixturevalue("few_views")  # of this process alone
     if "tradeoff" in call.text:
         pytest.importorskip("matplotlib")
     if {"--streamed-sog", "--tiles"} & set(call.text.split()) and "levels" in call.text and find_tool() is None:
         pytest.skip("splat-transform is not installed")
-    monkeypatch.chdir(demo_scene)
+    monkeypatch.chdir(small_scene)
     words = shlex.split(call.text)[1:]
     for place, word in enumerate(words):
         if word == "DIR":
             words[place] = "images" if words[place - 1] == "--images" else str(tmp_path / "results")
-    for extra in (["--steps", "3"], ["--repeats", "1"]):
-        if extra[0][2:] in inspect.signature(COMMANDS[words[0]]).parameters and extra[0] not in words:
-            words += extra
-    words += ["--overwrite"] if "overwrite" in inspect.signature(COMMANDS[words[0]]).parameters else []
-    assert cli.main(words) == 0, capsys.readouterr().err
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("piece", PYTHON, ids=str)
-def test_python_runs_on_the_embedded_scene(piece, demo_scene, tmp_path, monkeypatch):
-    os.makedirs(tmp_path / "output")
-    shutil.copytree(demo_scene / "output/bicycle", tmp_path / "output/bicycle")
-    monkeypatch.chdir(tmp_path)
-    exec(compile(piece.text, str(piece), "exec"), {"__name__": "block"})
+    assert cli.main(shortened(words)) == 0, capsys.readouterr().err

@@ -84,7 +84,8 @@ def test_it_is_not_known_for_an_image_smaller_than_the_backbone_needs(random_wei
 
 def test_another_file_is_refused(tmp_path, random_weights):
     torch.save({"weights": torch.zeros(3)}, tmp_path / "other.pth")
-    for file in (tmp_path / "other.pth", random_weights("vgg")):
+    torch.save(torch.zeros(3), tmp_path / "tensor.pth")
+    for file in (tmp_path / "other.pth", tmp_path / "tensor.pth", random_weights("vgg")):
         with pytest.raises(CheckpointError, match="holds no alex backbone as torchvision saves it"):
             Perceptual("alex", file)
 

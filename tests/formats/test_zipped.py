@@ -1,6 +1,7 @@
 """A PLY or a model folder in a zip archive: read if it is alone there, and refused in a sentence otherwise."""
 
 import errno
+import struct
 import tempfile
 from unittest.mock import Mock
 
@@ -20,6 +21,8 @@ from mipmap_plugin.models import detect, load_model, zipped_folder
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
+END_OF_ARCHIVE = 22  # bytes
+
 
 @pytest.fixture
 def ply(tmp_path):
@@ -36,6 +39,14 @@ def spoil_one_row(path):
     columns = read_ply(path).columns
     columns["x"][3] = np.nan
     return write(path, columns)
+
+
+def test_a_part_of_an_archive_is_refused(tmp_path, ply):
+    """By its last bytes, which tell of another disk."""
+    whole = archive(tmp_path / "phone.zip", {"scan.ply": ply}).read_bytes()
+    where = struct.pack("<4sLQL", b"PK\x06\x07", 1, 0, 2)
+    (tmp_path / "phone.zip").write_bytes(whole[:-END_OF_ARCHIVE] + where + whole[-END_OF_ARCHIVE:])
+    refused(tmp_path / "phone.zip", "is a damaged zip archive .*multiple disks")
 
 
 @pytest.mark.parametrize("name", ["scan.ply", "my scan/point_cloud.PLY", "../../etc/out.ply", "/out.ply"])

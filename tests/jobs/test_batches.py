@@ -251,8 +251,9 @@ def test_a_list_of_cameras_beside_checkpoints_is_left_out_and_told_of(run, tmp_p
     assert run("adapt", tmp_path / "cameras.json", "--jobs", "2", *words)[0] == 2
 
 
-def test_a_list_that_is_no_text(tmp_path):
-    (tmp_path / "list").write_bytes(b"\xff\xfe\x00")
+@pytest.mark.parametrize("content", [b"\xff\xfe\x00", "scan.ply\n".encode("utf-16-be")], ids=["cut off", "UTF-16 that does not say so"])
+def test_a_list_that_is_no_text(tmp_path, content):
+    (tmp_path / "list").write_bytes(content)
     with pytest.raises(SettingsError, match="not a text file"):
         read_list(tmp_path / "list")
 

@@ -1,6 +1,9 @@
 """Jobs side by side, and what a killed or interrupted run leaves."""
 
+import io
 import os
+import pickle
+import queue
 import random
 import signal
 import subprocess
@@ -14,7 +17,7 @@ import pytest
 from running import saving_often, wait_until
 from small_jobs import QUICK, job_of
 
-from mipmap_plugin.jobs import summary
+from mipmap_plugin.jobs import serve, summary
 from mipmap_plugin.jobs import worker as jobs_worker
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.engines import in_workers, longest_first
@@ -65,6 +68,23 @@ def test_a_job_whose_worker_is_killed_is_done_again(worker, tmp_path, monkeypatc
     assert failed.status == "failed" and "was killed, perhaps for want of memory" in failed.reason
     worker.stop()
     assert do(job_of(tmp_path), worker).status == "interrupted"
+
+
+def half_of_a_job():
+    request = pickle.dumps((["of this version"], 1))
+    return request[: len(request) // 2]
+
+
+SENT = {"nothing": (b"", 0), "half a job": (half_of_a_job(), 0), "a job of another version": (b"cmipmap_plugin.jobs\nRemoved\n.", 1)}
+
+
+@pytest.mark.parametrize(("sent", "code"), SENT.values(), ids=SENT)
+@pytest.mark.usefixtures("capfd")  # for the traceback of the last one
+def test_a_worker_whose_input_ends_in_whatever_way_ends(sent, code, monkeypatch):
+    monkeypatch.setattr("os._exit", sys.exit)
+    with pytest.raises(SystemExit) as ended:
+        serve._read(io.BytesIO(sent), queue.SimpleQueue())
+    assert ended.value.code == code
 
 
 @pytest.mark.slow

@@ -20,6 +20,7 @@ from PIL import Image
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.optimization import resume
+from mipmap_plugin.adaptation.target import super_resolution
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.magic import SPLAT_RECORD
 from mipmap_plugin.formats.state_dict import read_state_dict
@@ -82,6 +83,11 @@ def open_exchange(path: Path) -> None:
     except CheckpointError as error:
         if "convert it first" not in str(error):
             raise
+
+
+def open_network(path: Path) -> None:
+    """The weights of an upsampler, of which spandrel makes a network."""
+    super_resolution._weights(path)
 
 
 def _quick_run(state: Path) -> Adapted:
@@ -272,6 +278,7 @@ SAMPLES: dict[str, Sample] = {
     "dataparser_transforms.json": Sample(_placed_splatfacto, "dataparser_transforms.json", ("of_json", *TEXT), open=open_placed),
     "state of a run": Sample(_state, "state", BINARY, open=open_state),
     "state dict of a network": Sample(_network, "net.pth", TORCH, open=lambda path: read_state_dict(path) and None),
+    "weights of an upsampler": Sample(_network, "net.pth", TORCH, open=open_network),
     "png": Sample(_pictures("PNG", "RGBA"), PICTURE, PICTURES, open=open_images),
     "png, 16 bits": Sample(_pictures("PNG", "I;16"), PICTURE, PICTURES, open=open_images),
     "png, palette": Sample(_pictures("PNG", "P"), PICTURE, PICTURES, open=open_images),

@@ -1,10 +1,13 @@
 """What README.md and docs/ hold: their blocks, and what is between backticks."""
 
+import inspect
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from mipmap_plugin import cli
+from mipmap_plugin.commands.adapt import Changes
+from mipmap_plugin.commands.many import Many
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -50,3 +53,9 @@ PYTHON = [Piece(page, block) for page in PAGES for block in blocks(page, python=
 def is_mention(words: list[str]) -> bool:
     """`mipmap-plugin adapt` alone is the name of a command, and nothing that is run."""
     return len(words) == 1 and words[0] in COMMANDS
+
+
+def options(command: str) -> set[str]:
+    """The names of a command's options, as Python writes them; those of `adapt` are partly in groups."""
+    names = set(inspect.signature(COMMANDS[command]).parameters)
+    return names.union(*(vars(group) for name, group in {"changes": Changes(), "many": Many()}.items() if name in names))

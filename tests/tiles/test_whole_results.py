@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from contextlib import nullcontext
 from dataclasses import replace
 from unittest.mock import Mock
@@ -161,6 +162,12 @@ def test_the_bar_of_a_tile_says_which_it_is_and_no_db(job, monkeypatch):
     monkeypatch.setattr(run, "announced", lambda what: (told.append(what), nullcontext())[1])
     adapt_in_tiles(replace(job, settings=job.settings | {"closed_form": False, "steps": 2}), 2)
     assert set(told) == {"cutting", "adapting tile 1 x0.5", "adapting tile 2 x0.5", "40 splats", "measuring the whole", "writing out.ply"}
+
+
+def test_the_steps_of_tiles_load_no_compiler(job, monkeypatch):
+    """As without tiles, where a backend moves the splats, too."""
+    monkeypatch.setitem(sys.modules, "torch.fx.experimental.symbolic_shapes", None)
+    assert adapt_in_tiles(job, 2).report.curve[-1].step > 0
 
 
 def test_no_tile_grows_beyond_what_the_settings_allow(job):

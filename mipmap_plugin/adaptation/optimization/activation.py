@@ -63,13 +63,13 @@ class Activation:
         splats = self._splats.tensors()
         gradients, self._splats, self._gradients = self._gradients, None, {}
         if gradients:
-            end = _WithGradients.apply(list(gradients.values()), *(splats[name] for name in gradients))  # type: ignore[no-untyped-call]  # torch's
+            end = WithGradients.apply(list(gradients.values()), *(splats[name] for name in gradients))  # type: ignore[no-untyped-call]  # torch's
             splats.clear()  # frees the memory of the joined colors for their gradients
             gradients.clear()
             end.backward()
 
 
-class _WithGradients(torch.autograd.Function):
+class WithGradients(torch.autograd.Function):
     """A number whose backward pass hands `gradients` on to `tensors`. torch.autograd.backward takes them too, but it loads sympy."""
 
     @staticmethod

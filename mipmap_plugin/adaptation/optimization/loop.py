@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization import density
-from mipmap_plugin.adaptation.optimization.activation import Activation
+from mipmap_plugin.adaptation.optimization.activation import Activation, WithGradients
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.checks import check, check_again, is_checked
 from mipmap_plugin.adaptation.optimization.ending import End
@@ -119,7 +119,7 @@ def _step_by_autograd(run: Run, task: Task, config: AdaptConfig, views: Sequence
         gaussians = splats(cameras[some[0]])
         images = task.images(gaussians, [cameras[view] for view in some], run.step * config.views_per_step + number)
         compared = compare(some, images, targets, config, task.scale, task.detail)
-        torch.autograd.backward(images, [gradient for gradient, _ in compared])
+        WithGradients.apply([gradient for gradient, _ in compared], *images).backward()  # type: ignore[no-untyped-call]  # torch's
         run.square_error = run.square_error + sum(square_error for _, square_error in compared) / len(views)
         if run.gradients is not None:
             run.gradients.add(*splats.means_gradient(gaussians), cameras[some[0]])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-import zipfile
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +16,7 @@ from mipmap_plugin.adaptation.target.disk_cache import cached, fingerprint
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError, brief, install
 from mipmap_plugin.formats.atomic import sha256
+from mipmap_plugin.formats.magic import archive, is_archive
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.formats.torchscript import read_torchscript
 from mipmap_plugin.process.torchvision_absent import torchvision_optional
@@ -62,11 +62,11 @@ def _load(path: Path) -> Any:
             import spandrel
         except ImportError as error:
             raise PluginError(f"{path}: spandrel is needed to load a super-resolution network; {INSTALL} ({error})") from error
+    weights = _weights(path)
     try:
-        weights = spandrel.canonicalize_state_dict(_weights(path))
         with _quietly():
-            network = spandrel.ModelLoader().load_from_state_dict(weights)
-    except (spandrel.UnsupportedModelError, RuntimeError, AttributeError, KeyError, TypeError) as error:
+            network = spandrel.ModelLoader().load_from_state_dict(spandrel.canonicalize_state_dict(weights))
+    except Exception as error:  # it concludes from shapes what a network is, and fails in any way where these are odd
         raise CheckpointError(f"{path}: not a network that spandrel supports ({brief(error)})") from error
     if not isinstance(network, spandrel.ImageModelDescriptor) or (network.input_channels, network.output_channels) != (3, 3):
         raise SettingsError(f"{path}: {network.architecture.name} does not turn one RGB image into another; give a super-resolution network")
@@ -97,10 +97,10 @@ def _weights(path: Path) -> Any:
 
 
 def _is_torchscript(path: Path) -> bool:
-    if not zipfile.is_zipfile(path):
+    if not is_archive(path):
         return False
-    with zipfile.ZipFile(path) as archive:
-        return any(name.endswith("/constants.pkl") for name in archive.namelist())
+    with archive(path) as opened:
+        return any(name.endswith("/constants.pkl") for name in opened.namelist())
 
 
 def _in_tiles(network: Any, image: Tensor) -> Tensor:

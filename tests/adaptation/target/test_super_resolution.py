@@ -82,11 +82,15 @@ def test_a_torchscript_file_is_read_without_being_executed(spandrel, tmp_path, m
 def test_what_is_no_enlarging_network_is_refused_in_a_sentence(spandrel, network_file, tmp_path):
     torch.save({"weights": Hostile()}, tmp_path / "hostile.pth")
     torch.save({"weights": torch.zeros(3)}, tmp_path / "other.pth")
+    torch.save(compact(spandrel).state_dict() | {"body.0.weight": torch.ones(())}, tmp_path / "odd.pth")
     (tmp_path / "text.safetensors").write_text("no tensors")
+    (tmp_path / "spoiled.pth").write_bytes((tmp_path / "other.pth").read_bytes().replace(b"PK\x01\x02", b"PK\x01\x03"))  # its list of contents
     for name, sentence in {
         "hostile.pth": "is not executed",
         "other.pth": "not a network that spandrel supports",
+        "odd.pth": "not a network that spandrel supports .tuple index out of range",
         "text.safetensors": "is damaged; download it again",
+        "spoiled.pth": "is a damaged zip archive",
     }.items():
         with pytest.raises(CheckpointError, match=sentence):
             Network(tmp_path / name)
