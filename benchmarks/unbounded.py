@@ -44,6 +44,8 @@ name says (of bird_272 one of 8, on which the base was not trained either), or 2
 cameras. The protocol says by what: *N x N samples*, the base's own image averaged; *base, bicubic*, the same shrunk by Pillow's bicubic (a zoom-in
 is shrunk itself and compared with the base's image as it is); P3, photographs. What is the truth itself has no row. Of flowers at x2 the base's
 cameras are half as large, and Lanczos takes a network's place. One thread of a shared machine.
+
+Compare no SSIM of `instant` with that of other rows, but of yashica: these are of an earlier version, whose SSIM left a border of 5 px out.
 """
 
 LANCZOS = dict(upsampler="lanczos as a network")

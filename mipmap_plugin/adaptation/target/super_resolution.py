@@ -19,6 +19,7 @@ from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.magic import archive, is_archive
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.formats.torchscript import read_torchscript
+from mipmap_plugin.limits import is_out_of_memory
 from mipmap_plugin.process.torchvision_absent import torchvision_optional
 
 SUFFIXES = (".pth", ".pt", ".ckpt", ".safetensors")
@@ -67,6 +68,8 @@ def _load(path: Path) -> Any:
         with _quietly():
             network = spandrel.ModelLoader().load_from_state_dict(spandrel.canonicalize_state_dict(weights))
     except Exception as error:  # it concludes from shapes what a network is, and fails in any way where these are odd
+        if is_out_of_memory(error):
+            raise
         raise CheckpointError(f"{path}: not a network that spandrel supports ({brief(error)})") from error
     if not isinstance(network, spandrel.ImageModelDescriptor) or (network.input_channels, network.output_channels) != (3, 3):
         raise SettingsError(f"{path}: {network.architecture.name} does not turn one RGB image into another; give a super-resolution network")

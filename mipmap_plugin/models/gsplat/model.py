@@ -31,7 +31,6 @@ from mipmap_plugin.models.vanilla import Origin, VanillaModel
 
 PLACE, FILE = GSPLAT
 
-
 # World units, the trainer's default.
 NEAR_PLANE = 0.01
 

@@ -3,6 +3,7 @@
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -96,6 +97,12 @@ def test_what_is_no_enlarging_network_is_refused_in_a_sentence(spandrel, network
             Network(tmp_path / name)
     with pytest.raises(SettingsError, match="does not enlarge images; give one that does"):
         Network(network_file(scale=1))
+
+
+def test_memory_that_runs_out_is_not_told_as_a_file_of_something_else(spandrel, network_file, monkeypatch):
+    monkeypatch.setattr(spandrel.ModelLoader, "load_from_state_dict", Mock(side_effect=MemoryError))
+    with pytest.raises(MemoryError):
+        Network(network_file())
 
 
 def test_a_file_that_is_not_there_and_a_name_that_nobody_registered():
