@@ -181,6 +181,8 @@ def main(
     """
     if unknown := set(only) - CAPTURES.keys():
         raise SystemExit(f"there is no capture {', '.join(sorted(unknown))}; known are {', '.join(CAPTURES)}")
+    if unknown := set(recipe) - {known for capture in CAPTURES.values() for each in capture.scales for known in recipes(capture, each)}:
+        raise SystemExit(f"no capture has a row {', '.join(sorted(unknown))}")
     torch.set_num_threads(1)
     register_upsampler(LANCZOS["upsampler"], lambda image, size: resize(image, size, "lanczos"), replace=True)
     for name in only or CAPTURES:

@@ -28,7 +28,10 @@ UNSEEN = 1e-3
 
 def blend_weights(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects) -> Tensor:
     """The blend weight of each splat, summed over the pixels of a view and averaged over `views`: [N] in pixels; 0 for an invisible splat."""
-    return weighed(gaussians, views, backend, effects)[0]
+    total = torch.zeros_like(gaussians.opacities)
+    for some in _of_views(gaussians, views, backend, effects):
+        total += some.sum(0)
+    return total / len(views)
 
 
 def weighed(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects, size: float = 1.0) -> tuple[Tensor, float]:
