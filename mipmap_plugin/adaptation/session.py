@@ -135,9 +135,8 @@ class Session:
     def _compile(self, model: SplatModel) -> None:
         """Let the backend compile what the run will call for splats such as the model's, in a phase of its own."""
         merging, effects = self.config.merge_to < 1 and self._has_blend_weights, (self.drawn.base, *self.drawn.targets.values())
-        takes_steps, by_rows = self._takes_steps, self.base.traits.plain and self.config.densify_gradient is None
         with self.phase("compilation"):
-            calls = calls_of(self.views, self.scale, self.config.views_per_step, gradients=takes_steps, merging=merging, by_rows=by_rows)
+            calls = calls_of(self.views, self.scale, self.config, gradients=self._takes_steps, merging=merging, plain=self.base.traits.plain)
             warm_up(self.backend, model.gaussians(self.views[0]), effects, calls)
 
     def _start_problems(self) -> list[StartProblem]:

@@ -191,6 +191,7 @@ class AdamStep:
         correction: 1 / sqrt(1 - beta2^t).
         eps: Added to the root of the second moment.
         nesterov: With beta1 · first + (1 - beta1) · gradient in place of the first moment (Dozat 2016, without its schedule of beta1).
+        means_gradient: [N, 3], where the gradient of the means is written if it is given; splats grow by it.
     """
 
     raw: Mapping[str, Tensor]
@@ -201,6 +202,7 @@ class AdamStep:
     correction: float
     eps: float
     nesterov: bool = False
+    means_gradient: Tensor | None = None
 
 
 class Stepper(Protocol):

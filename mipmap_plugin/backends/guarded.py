@@ -142,9 +142,12 @@ class _GuardedStepper:
             return theirs(*arguments)
 
     def step(self, step: AdamStep) -> None:
+        written = dict(step.raw)
+        if step.means_gradient is not None:
+            written["the gradient of the means"] = step.means_gradient.fill_(math.nan)  # for one that does not write it
         self._named(self._theirs.step, step)
-        finite = torch.stack([tensor.isfinite().all() for tensor in step.raw.values()]).tolist()  # a GPU is waited for once
-        if wrong := [name for name, whole in zip(step.raw, finite, strict=True) if not whole]:
+        finite = torch.stack([tensor.isfinite().all() for tensor in written.values()]).tolist()  # a GPU is waited for once
+        if wrong := [name for name, whole in zip(written, finite, strict=True) if not whole]:
             raise PluginError(f"{self._title}: a step left NaN or infinity in {', '.join(wrong)}")
 
 

@@ -124,13 +124,27 @@ class ForgetsTheOpacity:
     def step(self, step):
         for name, moment in step.first.items():
             moment.copy_((1 - step.betas[0]) * (self._opacities if name == "opacities" else self._raw[name]).grad)
+        step.means_gradient.copy_(self._raw["means"].grad)
+
+
+class TellsNoGradient(ForgetsTheOpacity):
+    def step(self, step):
+        super().step(replace(step, means_gradient=step.means_gradient.clone()))
+
+
+def of_steps(stepper) -> str:
+    backend = ReferenceBackend()
+    backend.stepper = stepper
+    return check_steps(backend, CASES["sh-degree-3"]).message
 
 
 def test_a_step_along_wrong_gradients_is_caught():
-    backend = ReferenceBackend()
-    backend.stepper = ForgetsTheOpacity
-    outcome = check_steps(backend, CASES["sh-degree-3"])
-    assert outcome.message.startswith("gradient of opacities") and "means" not in outcome.message
+    message = of_steps(ForgetsTheOpacity)
+    assert message.startswith("gradient of opacities") and "means" not in message
+
+
+def test_a_step_that_does_not_tell_the_gradient_that_splats_grow_by_is_caught():
+    assert of_steps(TellsNoGradient).startswith("gradient of means, by which splats grow: ")
 
 
 def test_gradients_one_percent_too_long_are_caught():

@@ -9,7 +9,7 @@ import torch
 from their_families import BRIEF
 
 from mipmap_plugin import register_backend, wrap_model
-from mipmap_plugin.backends.base import Rendered
+from mipmap_plugin.backends.base import AdamStep, Rendered
 from mipmap_plugin.backends.conformance import CASES, check_backend, summary
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
@@ -148,6 +148,14 @@ def test_a_stepper_that_draws_all_views_in_one_call_still_does_and_fails_by_its_
     base = backend(lambda rendered, _: rendered, stepper=lambda self, raw: Failing())
     with pytest.raises(PluginError, match="backend 'odd' failed: ZeroDivisionError"):
         base.backend()[0].stepper({}).render_all([])
+
+
+def test_a_stepper_that_writes_no_gradient_for_growing_is_told():
+    raw = {"means": torch.zeros(2, 3)}
+    stepper = type("Silent", (), {"step": lambda self, step: None})
+    base = backend(lambda rendered, _: rendered, stepper=lambda self, raw: stepper())
+    with pytest.raises(PluginError, match="backend 'odd': a step left NaN or infinity in the gradient of the means"):
+        base.backend()[0].stepper(raw).step(AdamStep(raw, {}, {}, {}, (0.9, 0.99), 1.0, 1.0, means_gradient=torch.zeros(2, 3)))
 
 
 def test_a_backend_that_fails_ends_a_command_in_a_sentence(tmp_path, capsys):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -51,11 +51,11 @@ class ByRows:
         """Draw the views of a step, whose first is the `draw`-th since the beginning, and compare their images; return the mean square errors."""
         return self.draw.differentiate(self.stepper, cameras, draw, compare)
 
-    def step(self, optimizer: Adam, color_limits: tuple[float, float] | None = None) -> None:
-        """Move the parameters, once some views are differentiated. color_limits: as of `Task`."""
+    def step(self, optimizer: Adam, color_limits: tuple[float, float] | None = None, means_gradient: Tensor | None = None) -> None:
+        """Move the parameters, once some views are differentiated. color_limits: as of `Task`; means_gradient: as of `AdamStep`."""
         if self.moments is None or not self.moments.are_of(optimizer):
             self.moments = _Moments.of(optimizer, self.parameters)
-        self.stepper.step(self.moments.next_step(optimizer, self.raw))
+        self.stepper.step(replace(self.moments.next_step(optimizer, self.raw), means_gradient=means_gradient))
         if color_limits is not None:
             self.raw["sh"][:, 0].clamp_(*color_limits)
             self.versions = _versions(self.parameters)

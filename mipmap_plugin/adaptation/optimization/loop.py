@@ -79,9 +79,9 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera]) ->
         density.reset_opacities(run.optimizer)
     task.follow(run.student)
     set_rates(run.optimizer, config, run.progress(config), run.steering.rate_factor(run.step, config), frozen_parameters(run))
-    growing = run.gradients is not None  # by the gradients of each view, which no step by rows has
+    growing = run.gradients is not None  # by the gradients of each view
     at_once = 1 if growing else views_at_once(task.cameras[view] for view in views)
-    run.by_rows = None if growing or len(views) > at_once else ByRows.of(run.student, task.render_to_step, run.by_rows)
+    run.by_rows = ByRows.of(run.student, task.render_to_step, run.by_rows) if len(views) <= at_once else None
     if run.by_rows is not None:
         _step_by_rows(run, run.by_rows, task, config, views)
     else:
@@ -101,7 +101,12 @@ def _step_by_rows(run: Run, rows: ByRows, task: Task, config: AdaptConfig, views
 
     square_errors = rows.differentiate([task.cameras[view] for view in views], run.step * config.views_per_step, compared)
     run.square_error = run.square_error + torch.stack(square_errors).mean()
-    rows.step(run.optimizer, task.color_limits)
+    if run.gradients is None:
+        rows.step(run.optimizer, task.color_limits)
+    else:
+        means = run.student.parameters()["means"].detach().clone()  # as they were drawn
+        rows.step(run.optimizer, task.color_limits, gradient := torch.empty_like(means))
+        run.gradients.add(means, gradient, task.cameras[views[0]])
 
 
 # --8<-- [end:step]

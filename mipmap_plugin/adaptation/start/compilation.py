@@ -15,6 +15,7 @@ from mipmap_plugin.adaptation.start.closed_form import closed_form
 from mipmap_plugin.adaptation.start.merging import merge
 from mipmap_plugin.backends.base import AdamStep, Calls
 from mipmap_plugin.camera import ONE_PIXEL, Camera
+from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import OF_3DGS
@@ -42,11 +43,12 @@ def warm_up(backend: Any, gaussians: Gaussians, effects: Sequence[Effects], call
             _step(backend, few, kind)
 
 
-def calls_of(views: Sequence[Camera], scale: float, per_step: int, *, gradients: bool, merging: bool, by_rows: bool) -> Calls:
-    """What an adaptation over views of the base's scale calls; by_rows: whether the backend may move the model's rows itself."""
+def calls_of(views: Sequence[Camera], scale: float, config: AdaptConfig, *, gradients: bool, merging: bool, plain: bool) -> Calls:
+    """What an adaptation over views of the base's scale calls; plain: whether the backend may move the model's rows itself (`Traits.plain`)."""
     zoomed = [view.zoomed(scale) for view in views]
     pixels = [view.width * view.height for view in (*views, *zoomed)]
-    return Calls(gradients, merging, by_rows and per_step <= views_at_once(zoomed), (min(pixels), max(pixels) * per_step))
+    at_once, per_step = views_at_once(zoomed) if config.densify_gradient is None else 1, config.views_per_step
+    return Calls(gradients, merging, plain and per_step <= at_once, (min(pixels), max(pixels) * per_step))
 
 
 def _step(backend: Any, splats: Gaussians, effects: Effects) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -20,6 +21,9 @@ from mipmap_plugin.splatting.rotations import unit_quaternions
 
 # The share of the cases that has to be run to tell whether a backend is right. With a single screen filter, degree 0 and no settings it is a sixth.
 LEAST_RUN = 1 / 20
+
+# What `AdamStep.means_gradient` is called in a sentence.
+TOLD = "means, by which splats grow"
 
 
 @dataclass(frozen=True)
@@ -129,8 +133,8 @@ def _raw_answer(backend: Backend, raw: Mapping[str, Tensor], case: HardCase) -> 
     leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in raw.items()}
     activated = {"quats": unit_quaternions(leaves["quats"]), "scales": leaves["scales"].exp(), "opacities": leaves["opacities"].sigmoid()}
     rendered = backend.render(Gaussians(**{**leaves, **activated}), case.camera, case.effects)
-    grads = torch.autograd.grad(_squares(rendered), list(leaves.values()))
-    return Answer(_plain(rendered.image), _plain(rendered.alpha)[..., None], dict(zip(leaves, map(_plain, grads), strict=True)))
+    grads = dict(zip(leaves, map(_plain, torch.autograd.grad(_squares(rendered), list(leaves.values()))), strict=True))
+    return Answer(_plain(rendered.image), _plain(rendered.alpha)[..., None], grads | {TOLD: grads["means"]})
 
 
 def _step_answer(backend: Any, raw: Mapping[str, Tensor], case: HardCase) -> Answer:
@@ -141,8 +145,10 @@ def _step_answer(backend: Any, raw: Mapping[str, Tensor], case: HardCase) -> Ans
     rendered = stepper.render(0, case.camera, case.effects)
     stepper.differentiate(0, 2 * rendered.image, 2 * rendered.alpha)  # the gradients of `_squares`
     rates = dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 0.0)
-    stepper.step(AdamStep(own, first, second, rates, betas=(beta, beta), correction=1.0, eps=1.0))
-    return Answer(_plain(rendered.image), _plain(rendered.alpha)[..., None], {name: _plain(each) / (1 - beta) for name, each in first.items()})
+    told = torch.full_like(own["means"], math.nan)
+    stepper.step(AdamStep(own, first, second, rates, betas=(beta, beta), correction=1.0, eps=1.0, means_gradient=told))
+    grads = {name: _plain(each) / (1 - beta) for name, each in first.items()} | {TOLD: _plain(told)}
+    return Answer(_plain(rendered.image), _plain(rendered.alpha)[..., None], grads)
 
 
 def _squares(rendered: Rendered) -> Tensor:

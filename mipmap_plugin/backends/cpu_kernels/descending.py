@@ -26,6 +26,7 @@ def descend(splats: SplatArrays, views: Sequence[tuple[Drawing, np.ndarray]], st
     threads = team(count * len(views))
     raw, firsts, seconds = (_arrays(tensors) for tensors in (step.raw, step.first, step.second))
     rates = _rates(step, splats.sh.shape[1])
+    means_gradient = None if step.means_gradient is None else step.means_gradient.numpy()
     new_first, new_second = 1 - step.betas[0], 1 - step.betas[1]
     settings = tuple(np.float32(number) for number in (new_first, new_second, new_first * step.nesterov, step.correction, step.eps))
 
@@ -35,6 +36,8 @@ def descend(splats: SplatArrays, views: Sequence[tuple[Drawing, np.ndarray]], st
             last = min(first + ROWS, stop)
             grads = room.zeros(last - first)
             add_views(first, last, splats, views, grads)
+            if means_gradient is not None:
+                means_gradient[first:last] = grads.means
             adam.step(first, last, splats, grads, raw, firsts, seconds, rates, settings)
 
     threads.share(move, count, of_rows=True)

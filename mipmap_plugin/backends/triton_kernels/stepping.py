@@ -68,6 +68,8 @@ class TritonStepper:
             for nth, number in enumerate(sorted(self._gradients)):
                 project_back(self._splats, self._drawn[number].projected, self._gradients[number], self._grads, further=nth > 0)
             self._move(step)
+            if step.means_gradient is not None:
+                step.means_gradient.copy_(self._grads.means)
         self._drawn.clear()
         self._gradients.clear()
 

@@ -105,6 +105,16 @@ def test_both_kinds_of_steps_go_on_from_one_another():
         torch.testing.assert_close(mixed[name], tensor, atol=2e-5, rtol=2e-3, msg=lambda text, name=name: f"{name}: {text}")
 
 
+def test_a_step_tells_the_gradient_of_the_means_by_which_splats_grow():
+    model, told = student(), torch.full((77, 3), torch.nan)
+    rows = of(model)
+    differentiate(rows)
+    rows.step(optimizer_of(model), means_gradient=told)
+    dense = student()
+    loss(BACKEND.render_views(dense.gaussians(), SHOTS)).backward()
+    torch.testing.assert_close(told, dense.parameters()["means"].grad, atol=1e-7, rtol=1e-4)
+
+
 def test_a_step_has_the_same_bytes_on_any_number_of_threads(monkeypatch):
     from mipmap_plugin.backends.cpu_kernels import descending, threads
 

@@ -10,6 +10,7 @@ import pytest
 import tiny
 import torch
 
+from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.growing import frozen_parameters
 from mipmap_plugin.adaptation.optimization.run import Task, Trial
 from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
@@ -116,12 +117,28 @@ def test_without_growing_nothing_is_on_trial(monkeypatch):
     assert not torch.equal(start, end)
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])  # the latter moves splats itself, as long as none grows
+@pytest.mark.parametrize("backend", ["reference", "cpu"])  # the latter moves splats itself
 def test_published_growing_is_not_on_trial(monkeypatch, backend):
     monkeypatch.setattr(Task, "agreement", lambda *_: pytest.fail("asked"))
     model = wrap_model(tiny.model(), cameras=tiny.cameras(6), backend=backend)
     run = model.adapt(2, recipe="paper", steps=3, prune_every=2, densify_gradient=1e-12)
     assert run.report.gaussians_after > len(tiny.model())
+
+
+def test_by_rows_the_same_splats_grow_as_by_autograd(monkeypatch):
+    pytest.importorskip("numba", reason="numba, the extra `cpu`, is not installed")
+    stepped, step = [], ByRows.step
+    monkeypatch.setattr(ByRows, "step", lambda *args, **options: stepped.append(1) or step(*args, **options))
+    runs = []
+    for _ in range(2):
+        model = wrap_model(tiny.model(), cameras=tiny.cameras(6), backend="cpu")
+        runs.append(model.adapt(1 / 2, recipe="paper", steps=8, prune_every=3, densify_gradient=2e-3, rates=LearningRates(means=0.1)))
+        assert len(stepped) == 8
+        monkeypatch.setattr(ByRows, "of", lambda *_: None)
+    by_rows, by_autograd = (run.model.parameters() for run in runs)
+    assert len(tiny.model()) < len(by_rows["means"]) < 3 * len(tiny.model())
+    for name, tensor in by_autograd.items():
+        torch.testing.assert_close(by_rows[name], tensor, atol=2e-3, rtol=2e-3, msg=lambda text, name=name: f"{name}: {text}")
 
 
 def test_agreement_at_the_start_is_that_of_the_closed_form(monkeypatch):
