@@ -93,6 +93,11 @@ def mean_pixel_size(means: Tensor, views: Sequence[Camera], count: int | None = 
     return found.masked_scatter(unseen, pixel_size(means[unseen], views, count, largest))
 
 
+def pictured(means: Tensor, views: Sequence[Camera]) -> Tensor:
+    """[N] bool: which means [N, 3] lie in the picture of a view."""
+    return _finest(means, views)[1] > 0
+
+
 def seen_pixel_size(means: Tensor, views: Sequence[Camera], near: float) -> Tensor:
     """`pixel_size` of those of the means [N, 3] that are in a picture, beyond `near` (world units): [M], M at most N; 0 if nothing is seen."""
     seen, _ = _finest(means, every_nth(views, _closest_of(means, views)), near)

@@ -9,7 +9,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.parallel import in_batches, max_threads, together
+from mipmap_plugin.adaptation.parallel import max_threads, together
+from mipmap_plugin.adaptation.pixel_size import pictured
 from mipmap_plugin.adaptation.start.closed_form import filter_variance
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
@@ -88,16 +89,8 @@ def may_show(weights: Tensor, whole: Tensor, means: Tensor, views: Sequence[Came
     seen = weights > UNSEEN * whole
     if len(looked_at) < len(views):
         rest = (~seen).nonzero()[:, 0]
-        seen[rest] = _pictured(means[rest], views) & ~_pictured(means[rest], looked_at)
+        seen[rest] = pictured(means[rest], views) & ~pictured(means[rest], looked_at)
     return seen
-
-
-def _pictured(means: Tensor, views: Sequence[Camera]) -> Tensor:
-    """[N] bool: which means [N, 3] lie in the picture of a view."""
-    found = torch.zeros(len(means), dtype=torch.bool, device=means.device)
-    for view in in_batches(views, means):
-        found |= view.in_picture(view.to_camera(means)).any(0)
-    return found
 
 
 @torch.enable_grad()

@@ -76,6 +76,8 @@ def test_splats_of_views_that_were_not_looked_at_may_be_shown():
     weights, whole = torch.tensor([0.5, 0.0, 0.0, 0.0]), torch.ones(4)
     assert may_show(weights, whole, means, views, [views[0], views[5]]).tolist() == [True, True, False, False]
     assert may_show(weights, whole, means, views, views).tolist() == [True, False, False, False]
+    for dtype in (torch.float32, torch.float64):  # one of them without kernels
+        assert may_show(whole, whole, means.to(dtype), views, views[:1]).all()
 
 
 def test_what_lies_behind_the_camera_has_none():

@@ -149,6 +149,14 @@ def test_steps_of_more_views_than_are_drawn_at_once_take_autograds_way(views, by
     assert asked == [by_rows]
 
 
+@pytest.mark.parametrize(("scale", "size"), [(1 / 2, 1.0), (1 / 4, 0.5), (1 / 8, 0.5)])
+def test_far_out_the_base_is_weighed_in_pictures_of_half_its_size(scale, size, monkeypatch):
+    sizes, real = [], base_weights.weighed
+    monkeypatch.setattr(base_weights, "weighed", lambda *given: sizes.append(given[-1]) or real(*given))
+    wrap_model(tiny.model(COUNT), cameras=tiny.cameras(6)).adapt(scale, recipe="instant")
+    assert set(sizes) == {size}
+
+
 def test_a_start_is_computed_from_as_many_views_as_show_enough(monkeypatch):
     """By what they show: splats behind others do not count."""
     counts, real = [], base_weights.weighed
