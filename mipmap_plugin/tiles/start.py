@@ -66,7 +66,10 @@ class StartSearch:
         self._take(FORMED, start_name(self.forms), formed)
 
     def _measured(self) -> Tensor:
-        """[N]: the blend weights of the base's splats, in target pixels of a view, from as many views as show enough of them, as without tiles."""
+        """[N]: the blend weights of the base's splats, in target pixels of a view, from as many views as show enough of them, as without tiles.
+
+        But always in views of their own size (`base_weights.HALF`).
+        """
         scene, painter = self.scene, self.scene.painter(self.scene.base_effects)
         first = evenly(scene.views.adapted, LEAST_VIEWS)
         weights, shown = painter.weighed(scene.base, first)

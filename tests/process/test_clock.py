@@ -65,6 +65,13 @@ def test_views_are_weighed_as_they_are_without_a_budget_and_where_they_are_small
     assert Clock(seconds, torch.device("cpu")).size(tiny.cameras(1)[0].resized(pixels, pixels), 12, pytest.fail) == 1.0
 
 
+def test_nothing_is_tried_where_views_are_weighed_at_half_their_size_anyway():
+    view, tried = tiny.cameras(1)[0], list[float]()
+    clock = Clock(1000.0, torch.device("cpu"))
+    assert clock.size(view.resized(1600, 1600), 12, pytest.fail, 0.5) == 0.5
+    assert clock.size(view.resized(8000, 8000), 12, tried.append, 0.5) == 0.5 and tried == [1 / 8]
+
+
 def test_a_further_start_has_the_time_that_the_first_has_left(monkeypatch):
     """Both together take at most half of a budget."""
     seconds, allowed = [0.0], []

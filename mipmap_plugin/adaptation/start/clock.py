@@ -15,7 +15,8 @@ from mipmap_plugin.process.clock import now
 # The fraction of a time budget that the start may take. Candidates that would not be finished in it are left out.
 START_SHARE = 0.5
 
-# px, the geometric mean of a view's sides: views are not made smaller than this to weigh splats in them, which takes a twentieth of a second.
+# px, the geometric mean of a view's sides: to save time views are not made smaller than this to weigh splats in them, which takes a twentieth of a
+# second.
 LEAST_SIDE = 1000
 
 # The fraction of the time left that weighing splats in the first views may take, since they are weighed again for the closed form.
@@ -45,15 +46,15 @@ class Clock:
         """Whether there is time for an amount of a work; `part`: in that part of the time, from its beginning on."""
         return self._spent() + amount * self._took.get(work, 0.0) <= part * self._seconds
 
-    def size(self, view: Camera, count: int, weigh: Callable[[float], object]) -> float:
-        """The fraction of its size at which so many views like `view` can be weighed; `weigh(fraction)` does it with one."""
+    def size(self, view: Camera, count: int, weigh: Callable[[float], object], most: float = 1.0) -> float:
+        """The fraction of its size, at most `most`, at which so many views like `view` can be weighed; `weigh(fraction)` does it with one."""
         least = LEAST_SIDE / math.sqrt(view.width * view.height)
-        if least >= 1 or not self.limited:
-            return 1.0
+        if least >= most or not self.limited:
+            return most
         with self.timing("trial"):
             weigh(least)
         possible = WEIGHING * (self._seconds - self._spent()) / (count * self._took["trial"])  # views of the least size, in place of each
-        return min(1.0, least * math.sqrt(max(1.0, possible)))
+        return min(most, least * math.sqrt(max(1.0, possible)))
 
     def rest(self) -> Clock:
         """Another one, of the time that is left."""
