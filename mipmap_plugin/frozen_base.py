@@ -262,7 +262,7 @@ class FrozenBase:
     @in_usual_modes
     def views(self) -> list[Camera]:
         """The checkpoint's cameras, or a generated orbit, for an adapted file that of its base, if it came without any."""
-        return self.cameras or choose_views([], replace(self.viewpoints, clear=list), AdaptConfig())[0]
+        return self.cameras or choose_views([], replace(self.viewpoints, clear=list, finer=False), AdaptConfig())[0]
 
     @cached_property
     def viewpoints(self) -> Viewpoints:

@@ -51,10 +51,11 @@ class Viewpoints:
     orbit: Orbit
     clear: Callable[[Sequence[Camera]], list[Camera]]  # those of the views that see it clearly (`ClearViews`)
     looks: float = math.inf  # so many views may be looked at (`amount.looks_in_budget`)
+    finer: bool = True  # whether some views are finer (`Orbit.views`): those that are adapted to, but not those that stand for the training's
 
     def views(self, size: tuple[int, int], count: int, generator: torch.Generator) -> list[Camera]:
         """`count` views of `size` (height, width) px. Of a capture they are clear: fewer where fewer are, and any, with a warning, where none is."""
-        first = self.orbit.views(size, count, generator)
+        first = self.orbit.views(size, count, generator, finer=self.finer)
         if not self.orbit.nearest:
             return first
         if self.looks < min(count, LEAST_LOOKS):
@@ -66,7 +67,7 @@ class Viewpoints:
             missing = count - len(found)
             most = int(min(math.ceil(missing * tried / max(1, len(found))), count, self.looks - tried))
             if most > 0:
-                looked_at = evenly(self.orbit.views(size, count, generator, number * count), most)
+                looked_at = evenly(self.orbit.views(size, count, generator, number * count, finer=self.finer), most)
                 found, tried = found + evenly(self.clear(looked_at), missing), tried + most
         if not found:
             warn(UNCLEAR)

@@ -116,10 +116,10 @@ class Orbit:
         name = next((name for name, axis in AXES.items() if axis == self.up), f"({', '.join(f'{part:.3g}' for part in self.up)})")
         return f"{where}, with {name} up"
 
-    def views(self, size: tuple[int, int], count: int, generator: torch.Generator, first: int = 0) -> list[Camera]:
+    def views(self, size: tuple[int, int], count: int, generator: torch.Generator, first: int = 0, *, finer: bool = True) -> list[Camera]:
         """`count` views of `size` (height, width) px: from above the horizon, or from all around where no vertical is known (the highest first).
 
-        `first`: the number of the first of them, in their names.
+        `first`: the number of the first of them, in their names; `finer`: whether in every fifth of a capture pixels are half as large.
         """
         if count < 1:
             raise SettingsError(f"an orbit needs views, but got {count}")
@@ -129,7 +129,7 @@ class Orbit:
         # Two far, two near: if all views of one part of the turn were near, these would be on one side only, and if every other view were, all of
         # them would be in the same half of the validation views.
         far = [self.distance if i // 2 % 2 == 0 else self.nearest or self.distance for i in range(count)]
-        fine = [FINER if (first + i) % EVERY == EVERY - 1 else 1.0 for i in range(count)]
+        fine = [FINER if finer and (first + i) % EVERY == EVERY - 1 else 1.0 for i in range(count)]
         # But for that all show the middle in the same detail.
         focals = [detail * self.focal * each / (self.nearest or each) for detail, each in zip(fine, far, strict=True)]
         views = [

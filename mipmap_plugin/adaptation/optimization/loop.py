@@ -105,7 +105,8 @@ def _step_by_rows(run: Run, rows: ByRows, task: Task, config: AdaptConfig, views
         rows.step(run.optimizer, task.color_limits)
     else:
         means = run.student.parameters()["means"].detach().clone()  # as they were drawn
-        rows.step(run.optimizer, task.color_limits, gradient := torch.empty_like(means))
+        gradient = torch.empty_like(means)
+        rows.step(run.optimizer, task.color_limits, gradient)
         run.gradients.add(means, gradient, task.cameras[views[0]])
 
 

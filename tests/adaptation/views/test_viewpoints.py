@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import tiny
 import torch
+from lone_capture import capture
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation.optimization.amount import DRAWS_A_SECOND, FOR_LOOKS, looks_in_budget
@@ -130,6 +131,14 @@ def lone_capture():
     splats = scene(floater=0.04)
     far = torch.cat([splats.means[:-60], 40 * torch.randn(60, 3, generator=torch.Generator().manual_seed(0))])
     return wrap_model(VanillaModel.from_gaussians(replace(splats, means=far)))
+
+
+@pytest.mark.filterwarnings("ignore:no ")
+def test_views_that_are_adapted_to_are_finer_but_not_those_that_stand_for_the_training():
+    """From those follow the distances of a ladder."""
+    lone = wrap_model(VanillaModel.from_gaussians(capture().to(dtype=torch.float32)))
+    details = [{round(view.fx / 10) for view in views} for views in (lone.views(), lone.adapt(1 / 4, recipe="instant", extra_views=20).adapted_to)]
+    assert [len(each) for each in details] == [2, 4]  # from near and from far
 
 
 @pytest.mark.filterwarnings("ignore:no cameras are known")
