@@ -41,9 +41,9 @@ INTRO = """# Captures
 
 Made by `python benchmarks/unbounded.py DATA`, judged on views that nothing was adapted to: those held out of the cameras, one of so many as the
 name says (of bird_272 one of 8, on which the base was not trained either), or 24 new views of an orbit where the checkpoint came without
-cameras. The protocol says by what: *N x N samples*, the base's own image averaged; *base, bicubic*, the same shrunk by Pillow's bicubic (a zoom-in
-is shrunk itself and compared with the base's image as it is); P3, photographs. What is the truth itself has no row. Of flowers at x2 the base's
-cameras are half as large, and Lanczos takes a network's place. One thread of a shared machine.
+cameras (of yashica a fifth with pixels half as large). The protocol says by what: *N x N samples*, the base's own image averaged; *base, bicubic*,
+the same shrunk by Pillow's bicubic (a zoom-in is shrunk itself and compared with the base's image as it is); P3, photographs. What is the truth
+itself has no row. Of flowers at x2 the base's cameras are half as large, and Lanczos takes a network's place. One thread of a shared machine.
 
 Compare no SSIM of `instant` with that of other rows, but of yashica: these are of an earlier version, whose SSIM left a border of 5 px out.
 """

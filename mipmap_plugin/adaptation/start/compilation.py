@@ -47,8 +47,8 @@ def calls_of(views: Sequence[Camera], scale: float, config: AdaptConfig, *, grad
     """What an adaptation over views of the base's scale calls; plain: whether the backend may move the model's rows itself (`Traits.plain`)."""
     zoomed = [view.zoomed(scale) for view in views]
     pixels = [view.width * view.height for view in (*views, *zoomed)]
-    at_once, per_step = views_at_once(zoomed) if config.densify_gradient is None else 1, config.views_per_step
-    return Calls(gradients, merging, plain and per_step <= at_once, (min(pixels), max(pixels) * per_step))
+    at_once = views_at_once(zoomed) if config.densify_gradient is None else 1  # splats grow by the gradients of each view
+    return Calls(gradients, merging, plain and config.views_per_step <= at_once, (min(pixels), max(pixels) * config.views_per_step))
 
 
 def _step(backend: Any, splats: Gaussians, effects: Effects) -> None:
