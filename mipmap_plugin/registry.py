@@ -25,6 +25,11 @@ class Registry:
     def __init__(self, group: str, builtins: Mapping[str, Any]) -> None:
         self.group = group
         self._targets: dict[str, Any] = dict(builtins)
+        self.seal()
+
+    def seal(self) -> None:
+        """Count what is registered so far as built in."""
+        self._built_in = dict(self._targets)
 
     def add(self, name: str, target: Any, *, replace: bool = False) -> None:
         """Register `target` under `name`. Raises SettingsError if another target has the name already, or it is no name."""
@@ -69,6 +74,10 @@ class Registry:
     def is_taken(self, name: str) -> bool:
         """Whether a name is registered here, so that what an installed package has under the same name is not used."""
         return name in self._targets
+
+    def is_only_here(self, name: Any) -> bool:
+        """Whether what has this name was registered in this process, so that no other knows it."""
+        return name in self._targets and self._targets[name] is not self._built_in.get(name) and name not in self._installed()
 
     def _installed(self) -> Mapping[str, str]:
         return _points(entry_points, self.group, tuple((folder, _modified(folder)) for folder in sys.path))

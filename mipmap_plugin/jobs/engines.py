@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.errors import MipmapPluginError
+from mipmap_plugin.jobs.elsewhere import refuse_elsewhere
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.worker import Worker, do
 from mipmap_plugin.models import detect
@@ -30,9 +31,10 @@ def in_this_process(jobs: Sequence[Job], threads: int | None = None) -> Generato
 def in_workers(jobs: Sequence[Job], count: int, threads: int | None) -> Generator[Outcome, None, None]:
     """Do the jobs in at most `count` processes that share `threads` threads (None: all); yield each outcome when it is there.
 
-    Ctrl-C lets every running job save its state, and begins no other; a second one ends them at once. What was registered in this
-    process at run time is unknown in others; register it by an entry point.
+    Ctrl-C lets every running job save its state, and begins no other; a second one ends them at once. Raises SettingsError for a plug-in
+    that only this process knows.
     """
+    refuse_elsewhere(jobs)
     jobs = longest_first(jobs)
     count = min(count, len(jobs))
     workers = [Worker(max(1, (threads or usable_threads()) // count)) for _ in range(count)]

@@ -25,6 +25,7 @@ import dask
 from distributed import Client, Event, Future, KilledWorker, LocalCluster, as_completed
 
 from mipmap_plugin.errors import MipmapPluginError, SettingsError
+from mipmap_plugin.jobs.elsewhere import refuse_elsewhere
 from mipmap_plugin.jobs.engines import longest_first, usable_threads, with_interrupted
 from mipmap_plugin.jobs.finished import finished
 from mipmap_plugin.jobs.job import Job, Outcome
@@ -65,9 +66,10 @@ def on_dask(jobs: Sequence[Job], place: str, threads: int | None = None, *, send
     `threads`: of each job; of all jobs together for local:n. `send_files`: send checkpoints and get back what was made of them, also where workers
     see them; otherwise that is done if some worker does not see the first checkpoint. If any worker declares GPUs (`--resources GPU=1`), each job
     takes one.
-    Ctrl-C lets every running job save its state, and begins no other. Raises SettingsError for a place where there is no scheduler, or workers that
-    lack this package or have another version of it.
+    Ctrl-C lets every running job save its state, and begins no other. Raises SettingsError for a place where there is no scheduler, workers that
+    lack this package or have another version of it, and a plug-in that only this process knows.
     """
+    refuse_elsewhere(jobs)
     jobs, stopping = longest_first(jobs), threading.Event()
     given: WeakSet[Future[Outcome | Delivery]] = WeakSet()  # workers keep the outcome, with its files, of each task whose future is kept
     with _connected(place) as client, meanwhile(partial(_keep_workers, client, place, lambda: stopping.is_set() and client.cancel(list(given)))):

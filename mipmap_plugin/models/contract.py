@@ -160,7 +160,8 @@ def _refuse_gradients(family: str, copied: SplatModel, camera: Camera) -> None:
 
 def row_opacities(model: SplatModel, views: Sequence[Camera]) -> Tensor:
     """The model's `row_opacities`, [N]. Raises PluginError for anything else."""
-    opacities: Any = model.row_opacities(views)
+    with naming_any({f"family {model.family!r}": model}):
+        opacities: Any = model.row_opacities(views)
     rows = len(model.parameters()["means"])
     if not isinstance(opacities, Tensor) or tuple(opacities.shape) != (rows,) or not opacities.isfinite().all():
         got = f"a tensor {list(opacities.shape)}" if isinstance(opacities, Tensor) else type_of(opacities)

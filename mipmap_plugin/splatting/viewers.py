@@ -180,6 +180,7 @@ for _viewer in BUILT_IN:
 for _alias, _name in ALIASES.items():
     register_viewer(_alias, VIEWERS.get(_name))
 register_viewer("portable", tuple(viewer.name for viewer in BUILT_IN if viewer not in FURTHER))
+VIEWERS.seal()
 
 
 def _registered(name: str) -> Any:

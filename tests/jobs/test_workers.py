@@ -17,12 +17,20 @@ import pytest
 from running import saving_often, wait_until
 from small_jobs import QUICK, job_of
 
+from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS
+from mipmap_plugin.backends import BACKENDS
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.jobs import serve, summary
 from mipmap_plugin.jobs import worker as jobs_worker
 from mipmap_plugin.jobs.base import Base
+from mipmap_plugin.jobs.elsewhere import refuse_elsewhere
 from mipmap_plugin.jobs.engines import in_workers, longest_first
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.worker import Worker, WorkerDied, do
+from mipmap_plugin.models import Match
+from mipmap_plugin.models.families import FAMILIES, find_family
+from mipmap_plugin.recipes import RECIPES
+from mipmap_plugin.splatting.viewers import VIEWERS
 
 
 def test_workers_share_all_threads_where_jobs_are_few(tmp_path, monkeypatch):
@@ -40,6 +48,31 @@ def test_workers_begin_with_what_takes_longest(tmp_path):
     half, double = job, replace(job, scale=2.0)
     assert longest_first([missing, half, large, double]) == [large, double, half, missing]
     assert longest_first([half, replace(half, viewer="gsplat"), large])[1:] == [half, replace(half, viewer="gsplat")]
+
+
+@pytest.mark.parametrize(
+    ("registry", "name", "changes"),
+    [
+        (BACKENDS, "mine", lambda job: dict(base=replace(job.base, backend="mine"))),
+        (VIEWERS, "mine", lambda job: dict(viewer="mine")),
+        (RECIPES, "mine", lambda job: dict(recipe="mine")),
+        (UPSAMPLERS, "mine", lambda job: dict(settings={"upsampler": "mine"})),
+        (FAMILIES, "mine", lambda job: {}),
+        (FAMILIES, "3dgs", lambda job: {}),
+    ],
+)  # fmt: skip
+def test_what_only_this_process_knows_is_told_before_others_are_asked(tmp_path, registry, name, changes):
+    job = job_of(tmp_path)
+    record = replace(find_family("3dgs"), name=name, recognize=lambda files: Match(1.0, "all"))  # of what is no family only the name counts
+    told = f"'{name}' is registered in this process alone, and other processes, .*; register it by an entry"
+    with registry.temporarily(**{name: record}), pytest.raises(SettingsError, match=told):
+        next(in_workers([replace(job, **changes(job))], 2, None))
+
+
+def test_networks_that_each_process_reads_for_itself_are_no_concern(tmp_path):
+    job = job_of(tmp_path, settings={"upsampler": "net"}, network=tmp_path / "net.pt")
+    with UPSAMPLERS.temporarily(net=len):
+        refuse_elsewhere([job])
 
 
 @pytest.fixture

@@ -137,6 +137,11 @@ def test_a_family_that_fails_before_the_work_begins_is_told_by_its_name(tmp_path
         wrapped(refuse_output=without_room).refuse_output(tmp_path / "new.ply", overwrite=False)
 
 
+def test_a_family_that_fails_where_views_are_looked_through_is_told_by_its_name():
+    with pytest.raises(PluginError, match="family 'theirs' failed: KeyError: 'rows'"):
+        wrapped(row_opacities=lambda self, views=(): {}["rows"]).refuse_undrawn()
+
+
 def half_doubles(self, form, views=()):
     raw = {name: tensor.detach() for name, tensor in self.parameters().items()}
     Gaussians(raw["means"].double(), raw["quats"], raw["scales"], raw["opacities"], raw["sh0"])
