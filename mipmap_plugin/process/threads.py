@@ -10,7 +10,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from contextvars import ContextVar, copy_context
 from functools import cache
 from operator import index
@@ -47,6 +47,11 @@ def _note_fork() -> None:
 
 if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
     os.register_at_fork(after_in_child=_note_fork)
+
+
+def of_fork() -> AbstractContextManager[None]:
+    """One thread for torch in a process that was forked, and else nothing."""
+    return _torch_threads(1) if _forked else nullcontext()
 
 
 def for_kernels() -> int:

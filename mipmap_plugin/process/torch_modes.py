@@ -11,6 +11,7 @@ from typing import Any, ParamSpec, TypeVar
 import torch
 
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.process.threads import of_fork
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -22,8 +23,9 @@ UNSET = "none"
 @contextmanager
 def usual_modes() -> Iterator[None]:
     """Inside, there is no autocast and no inference mode, new tensors are of float32 and on the processor by default, and products of matrices
-    are exact to float32."""
+    are exact to float32. In a process that was forked torch has one thread, as it waits forever for those of the parent."""
     with ExitStack() as stack:
+        stack.enter_context(of_fork())
         for kind in ("cpu", "cuda"):
             if torch.is_autocast_enabled(kind):
                 stack.enter_context(torch.autocast(kind, enabled=False))

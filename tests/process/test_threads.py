@@ -19,6 +19,7 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.models import load_model
 from mipmap_plugin.process import threads
+from mipmap_plugin.process.torch_modes import usual_modes
 from mipmap_plugin.wrap import wrap_model
 
 pytestmark = pytest.mark.usefixtures("few_views")
@@ -228,15 +229,35 @@ def test_a_wrapped_model_renders_with_its_own_threads():
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_a_forked_worker_that_asks_for_threads_does_not_wait_for_those_of_its_parent():
+    def work(large):
+        torch.set_num_threads(1)  # as DataLoader does
+        with threads.limited(2, shared=False):
+            large.exp()
+
+    ends_when_forked(work)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_forked_worker_that_gives_torch_no_number_of_threads_ends_too():
+    """As those of a Pool, by default on Linux before Python 3.14."""
+
+    def work(large):
+        with usual_modes():
+            large.exp()
+
+    ends_when_forked(work)
+
+
+def ends_when_forked(work):
+    """Wait for `work` on a large tensor in a process that was forked from one whose torch had two threads."""
     large = torch.ones(1 << 18)
     with torch_has(2):
         large.exp()  # in two threads
         worker = os.fork()
         if not worker:
             try:
-                torch.set_num_threads(1)  # as DataLoader does
-                with threads.limited(2, shared=False):
-                    large.exp()
+                work(large)
                 os._exit(0)
             finally:
                 os._exit(1)
