@@ -39,7 +39,8 @@ def backends(check: str | None = None, full: bool = False, json: bool = False) -
     failed = [row.case for row in outcomes if not row.passed]
     if failed:
         more = f" and {len(failed) - NAMED} more" if len(failed) > NAMED else ""
-        raise SettingsError(f"backend {check!r} fails {len(failed)} of {len(outcomes)} cases: {', '.join(failed[:NAMED])}{more}")
+        likely = f"; most likely {fault}" if (fault := tables.likely_fault(check)) else ""
+        raise SettingsError(f"backend {check!r} fails {len(failed)} of {len(outcomes)} cases: {', '.join(failed[:NAMED])}{more}{likely}")
     skipped = [row.message for row in outcomes if row.skipped]
     if len(outcomes) - len(skipped) < LEAST_RUN * len(outcomes):
         few = f"{len(outcomes) - len(skipped)} of {len(outcomes)} cases"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import product
 
@@ -12,6 +13,7 @@ import torch
 from mipmap_plugin.backends import get_backend, note_of, survey
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.conformance import CASES, MORE, Outcome, check_backend
+from mipmap_plugin.backends.conformance.usual_faults import usual_fault
 from mipmap_plugin.errors import BackendUnavailable, plural
 from mipmap_plugin.evaluation.report import markdown
 from mipmap_plugin.process import threads
@@ -51,6 +53,15 @@ def check(name: str, *, full: bool = False) -> list[Outcome]:
             if not all(outcome.skipped for outcome in outcomes):
                 return outcomes
     raise BackendUnavailable(f"backend {name!r} cannot be checked here: {outcomes[0].message}")
+
+
+def likely_fault(name: str) -> str:
+    """What seems to be wrong with a backend that was checked, in a sentence (`usual_fault`); "" if nothing usual."""
+    for device, dtype in product(_devices(), (torch.float32, torch.float64)):
+        with suppress(Exception):  # whatever a third-party backend raises was told case by case
+            if fault := usual_fault(get_backend(name), dtype=dtype, device=device):
+                return fault
+    return ""
 
 
 def listing_table(rows: Sequence[BackendStatus]) -> str:

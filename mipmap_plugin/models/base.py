@@ -109,7 +109,7 @@ class SplatModel(Protocol):
         notes: A list of remarks for the user on how it was read, in sentences.
         source: The file that was read; None: created in memory.
         folder: The model folder around it, whose cameras.json and cfg_args are read; None: there is none.
-        digest: sha256 of the file, hexadecimal; "" for a model created in memory, such as a copy.
+        digest: sha256 of the file, or of all that it was read from, hexadecimal; "" for a model created in memory, such as a copy.
     """
 
     family: str

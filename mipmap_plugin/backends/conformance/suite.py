@@ -8,6 +8,7 @@ import torch
 from mipmap_plugin.backends.base import API_VERSION, Backend
 from mipmap_plugin.backends.conformance.cases import CASES
 from mipmap_plugin.backends.conformance.checks import LEAST_RUN, check_case, check_steps, check_views, fitted, lowered
+from mipmap_plugin.backends.conformance.usual_faults import usual_fault
 
 
 class BackendSuite:
@@ -38,6 +39,11 @@ class BackendSuite:
         reasons = [reasons for build in CASES.values() if (reasons := fitted(self.backend, build, dtype=self.dtype, device=self.device)[1])]
         few = f"it can draw {len(CASES) - len(reasons)} of {len(CASES)} cases, too few to tell whether it is right"
         assert len(CASES) - len(reasons) >= LEAST_RUN * len(CASES), f"{few}; of the others it says: {'; '.join(reasons[0])}"
+
+    def test_makes_no_usual_mistake(self) -> None:
+        """Such as pixel centers at whole numbers, which a sentence tells sooner than the numbers of many cases."""
+        fault = usual_fault(self.backend, dtype=self.dtype, device=self.device)
+        assert not fault, fault
 
     @pytest.mark.parametrize("case", CASES)
     def test_equals_the_reference(self, case: str) -> None:

@@ -99,7 +99,7 @@ def _differing_vectors(what: str, actual: Tensor, expected: Tensor, tolerance: T
     length = float((actual - expected).norm()) / norm
     angle = 1 - float(torch.cosine_similarity(actual.flatten(), expected.flatten(), dim=0, eps=0))
     wrong = length > tolerance.length or not angle <= tolerance.angle
-    return [f"gradient of {what}, as one vector: off by {length:.2%} of its length, 1 - cosine is {angle:.1e}"] if wrong else []
+    return [f"gradient of {what}, as one vector: off by {length:.3g} of its length, 1 - cosine is {angle:.1e}"] if wrong else []
 
 
 def _listed(values: Tensor) -> str:
