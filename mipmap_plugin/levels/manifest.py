@@ -1,7 +1,11 @@
-"""`levels.json`: what a ladder's files are, when each is to be shown, and how good it then is. For anybody who writes a viewer or a converter."""
+"""`levels.json`: what a ladder's files are, when each is to be shown, and how good it then is. For anybody who writes a viewer or a converter.
+
+`levels.js` beside it is such a viewer, for pages of three.js.
+"""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -24,8 +28,11 @@ FORMAT = "mipmap_plugin levels 1"
 # px: the shorter side of the canvas that distances are computed for, unless another is given; they are in proportion to it.
 CANVAS = 1080
 
+# A module for pages of three.js, such as Spark's, that shows the level that fits.
+THREE_JS = "levels.js"
+
 # What is written into the folder of a ladder, also by what converts one.
-WRITTEN = (MANIFEST, "level_*.ply", f"level_*.ply{REPORT}", "report.html", "streamed/*", "tiles/*")
+WRITTEN = (MANIFEST, THREE_JS, "level_*.ply", f"level_*.ply{REPORT}", "report.html", "streamed/*", "tiles/*")
 
 
 def refuse_ladder(folder: Path, base: FrozenBase, *, overwrite: bool, room: int = 0) -> None:
@@ -44,7 +51,10 @@ def write_levels(levels: Sequence[Adapted], manifest_of: Callable[[list[Path]], 
     OutputError."""
     with new_folder(folder, overwrite) as temporary:
         files = [level.save(temporary / f"level_{number}.ply") for number, level in enumerate(levels)]  # 0 is the finest, as in other tools
-        write_json(temporary / MANIFEST, manifest_of(files), overwrite=False)
+        manifest = manifest_of(files)
+        write_json(temporary / MANIFEST, manifest, overwrite=False)
+        if "middle" in manifest:  # the module shows ladders by zoom
+            shutil.copyfile(Path(__file__).with_name(THREE_JS), temporary / THREE_JS)
     return folder
 
 
@@ -63,6 +73,7 @@ def manifest(ladder: Contents, files: list[Path]) -> dict[str, Any]:
         "least_db": ladder.request.least_db,
         "base": first.base,
         "base_pixel": base_pixel(ladder.base),
+        "middle": ladder.levels[0].adapted.model.parameters()["means"].detach().median(dim=0).values.tolist(),
         "levels": [_entry(ladder, number, file) for number, file in enumerate(files)],
         "left_out": [asdict(level) for level in ladder.left_out],
         "switches": [asdict(switch) for switch in ladder.switches],
