@@ -146,6 +146,13 @@ def test_splats_in_no_picture_have_no_part_in_the_size_of_a_pixel():
     assert sizes[0] == sizes[1] and 0 < sizes[2] < sizes[0] / 5
 
 
+def test_the_views_of_the_training_are_at_x1_by_what_they_look_at():
+    """Not by what is closest to one of them: viewers would change levels nearer than these are measured."""
+    views, ball = [camera.zoomed(scale) for camera, scale in zip(tiny.cameras(3), (1, 1, 2), strict=True)], tiny.gaussians(500, spread=0.3)
+    away = float((views[0].center - ball.means.double().median(0).values).norm())
+    assert base_pixel(wrap_model(VanillaModel.from_gaussians(ball), cameras=views)) == pytest.approx(away / views[0].fx, rel=0.05)
+
+
 def test_a_ladder_is_saved_when_its_base_is_gone(tmp_path):
     base = tiny.ply(tmp_path / "base.ply", degree=0)
     ladder = wrap_model(base, cameras=tiny.cameras(2, width=16, height=12)).levels("classic", coarsest=1.0)
