@@ -32,15 +32,18 @@ def load_vanilla(path: str | Path, *, iteration: int | None = None) -> VanillaMo
     return read_splats(detect_as(path, ("3dgs",), iteration=iteration), VanillaModel)
 
 
-def read_splats(checkpoint: Checkpoint, kind: type[Model]) -> Model:
-    """The splats of a checkpoint of 3DGS, or of a family that keeps them in the same columns, as a model of class `kind`. Raises CheckpointError."""
+def read_splats(checkpoint: Checkpoint, kind: type[Model], *networks: Path) -> Model:
+    """The splats of a checkpoint of 3DGS, or of a family that keeps them in the same columns, as a model of class `kind`. Raises CheckpointError.
+
+    `networks`: further files of the checkpoint, which count in its digest.
+    """
     path, folder = checkpoint.path, checkpoint.folder
     ply = read_ply(path)
     parameters, extras = kind.parameters_of(ply.columns, path), extra_columns(ply.columns)
     options, notes = read_options(folder)
     trained = trained_scale(options, ply.comments)
     screen_filter = trained.screen_filter if recorded_filter(ply.comments) else render_mode(ply.comments)
-    origin = Origin(path, sha256(path), folder, checkpoint.iteration, ply.comments, extras, read_exposures(folder))
+    origin = Origin(path, sha256(path, *networks), folder, checkpoint.iteration, ply.comments, extras, read_exposures(folder))
     model = kind(parameters, trained, origin, [*checkpoint.notes, *ply.notes, *notes, *notes_on_types(ply.columns)])
     del ply  # as large as the model, and no longer needed
     has_filter = FILTER_3D in extras  # whose family knows its screen filter

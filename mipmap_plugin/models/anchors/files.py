@@ -60,7 +60,8 @@ def read_anchors(path: str | Path, family: str, iteration: int | None) -> Anchor
     parameters, dropped = _checked(parameters, carried, weights, checkpoint.path)
     first = {name: column[:2].copy() for name, column in ply.columns.items()}
     options, notes = read_options(checkpoint.folder)
-    origin = Origin(checkpoint.path, sha256(checkpoint.path), checkpoint.folder, checkpoint.iteration, ply.comments)
+    digest = sha256(checkpoint.path, *(checkpoint.path.parent / name for name in companions))
+    origin = Origin(checkpoint.path, digest, checkpoint.folder, checkpoint.iteration, ply.comments)
     every_note = (*checkpoint.notes, *ply.notes, *notes, *dropped, *_rounded(ply.columns, carried, checkpoint.path))
     return AnchorFile(parameters, carried, weights, companions, options, trained_scale(options), origin, first, every_note)
 

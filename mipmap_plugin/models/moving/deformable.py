@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import relu
 
 from mipmap_plugin.errors import CheckpointError
-from mipmap_plugin.formats.state_dict import read_state_dict, require, run_layer, shapes_of
+from mipmap_plugin.formats.state_dict import require, run_layer, shapes_of
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.moving.memory import Changes
 from mipmap_plugin.models.moving.model import MovingModel, read_canonical
@@ -118,8 +118,8 @@ class DeformNetwork:
 
 def load_deformable(path: str | Path, *, iteration: int | None = None) -> MovingModel:
     """Load a model folder of Deformable 3D Gaussians. Raises CheckpointError if it is damaged, incomplete, or of another family."""
-    canonical, network = read_canonical(path, iteration, "deformable")
-    return MovingModel("deformable", canonical, DeformNetwork(read_state_dict(network), f"{network} is not a network as the project publishes it"))
+    canonical, network, weights = read_canonical(path, iteration, "deformable")
+    return MovingModel("deformable", canonical, DeformNetwork(weights, f"{network} is not a network as the project publishes it"))
 
 
 def embed(values: Tensor, frequencies: int) -> Tensor:

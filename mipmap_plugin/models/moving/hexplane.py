@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, relu
 
 from mipmap_plugin.errors import CheckpointError
-from mipmap_plugin.formats.state_dict import read_state_dict, require, run_layer, shapes_of
+from mipmap_plugin.formats.state_dict import require, run_layer, shapes_of
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.inria_folder import read_options
@@ -165,11 +165,11 @@ def load_hexplane(path: str | Path, *, iteration: int | None = None) -> MovingMo
         model = read_splats(checkpoint, VanillaModel)
         model.notes.append("it is of the coarse stage of 4D Gaussians, in which nothing moves yet")
         return model
-    canonical, network = read_canonical(path, iteration, "4dgs")
+    canonical, network, weights = read_canonical(path, iteration, "4dgs")
     options, _ = read_options(canonical.folder)
     if not options:
         canonical.notes.append("no cfg_args tells which of the network's changes are in use: opacities and colors are taken to stay, as published")
-    field = HexPlane(read_state_dict(network), options, f"{network} is not a network as the project publishes it")
+    field = HexPlane(weights, options, f"{network} is not a network as the project publishes it")
     if "shs_deform" in field.heads and canonical.sh_degree != 3:
         mismatch = f"{network} changes colors of SH degree 3, but its PLY has {canonical.sh_degree}"
         raise CheckpointError(f"{mismatch}; give the two that were saved together")

@@ -16,6 +16,7 @@ from mipmap_plugin.camera import Camera, every_nth
 from mipmap_plugin.effects import Effect
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.splat_transform import is_written
+from mipmap_plugin.formats.state_dict import read_state_dict
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale, Traits
 from mipmap_plugin.models.detect import detect_as
@@ -219,10 +220,11 @@ def _memories_of(field: Field) -> Sequence[Memory]:
     return (changes,) if field.slopes is None else (changes, Memory(field.slopes))
 
 
-def read_canonical(path: str | Path, iteration: int | None, family: str) -> tuple[VanillaModel, Path]:
-    """The canonical splats of a moving scene, and the file of their network. Raises CheckpointError."""
+def read_canonical(path: str | Path, iteration: int | None, family: str) -> tuple[VanillaModel, Path, dict[str, Tensor]]:
+    """The canonical splats of a moving scene, the file of their network, and its weights by name. Raises CheckpointError."""
     checkpoint = detect_as(path, (family,), iteration=iteration)
-    canonical = read_splats(checkpoint, VanillaModel)
-    title = find_family(family).title
+    network = network_of(checkpoint.path, family)
+    weights = read_state_dict(network)
+    canonical, title = read_splats(checkpoint, VanillaModel, network), find_family(family).title
     canonical.notes += [f"the network that moves the splats ({title}) is frozen: they adapt as they are before they move", TIMELESS]
-    return canonical, network_of(checkpoint.path, family)
+    return canonical, network, weights
