@@ -60,7 +60,7 @@ CELL_RANGE = 2**19
 MAX_OPACITY = 0.999
 
 
-class Rounds:
+class MergingRounds:
     """The pairs of each round, which are searched once for all fractions that the same splats are merged down to."""
 
     def __init__(self) -> None:
@@ -83,14 +83,14 @@ class Rounds:
         return pairs
 
 
-def merge(gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float, rounds: Rounds | None = None) -> tuple[Gaussians, Tensor]:
+def merge(gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float, rounds: MergingRounds | None = None) -> tuple[Gaussians, Tensor]:
     """Merge splats down to a `fraction` (0..1) of them; return them and their blend weights.
 
     Merging ends early when hardly any pairs are within `MAX_DISTANCE` and `MAX_COST`. `pixel` [N]: the size of a target pixel at each splat,
     in world units. `weights` [N]: the blend weight of each splat, in target pixels of a view. `rounds`: of an earlier call for the same splats.
     """
     splats, target_count = _Moments.of(gaussians, pixel, weights), max(1, math.floor(fraction * len(gaussians)))
-    rows, old_weights, rounds = torch.arange(len(gaussians), device=weights.device), splats.weights, rounds or Rounds()
+    rows, old_weights, rounds = torch.arange(len(gaussians), device=weights.device), splats.weights, rounds or MergingRounds()
     for number in count_from():
         surplus = len(splats.weights) - target_count
         if surplus <= 0 or (pairs := rounds.of(number, splats)) is None:
@@ -102,7 +102,7 @@ def merge(gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float,
 
 
 def merge_seen(
-    gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float, seen: Tensor, rounds: Rounds | None = None
+    gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float, seen: Tensor, rounds: MergingRounds | None = None
 ) -> tuple[Gaussians, Tensor]:
     """`merge` of the splats that are `seen` [N]; those that no view shows, which would not tell the harm, stay as they are, behind the others."""
     if seen.all():
