@@ -20,7 +20,8 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.adapted_scale import adapted_orbit
 from mipmap_plugin.models.base import SplatModel, places
 from mipmap_plugin.process.threads import side_by_side
-from mipmap_plugin.scenes.orbits import Orbit, sharp_size, sizes
+from mipmap_plugin.scenes.orbits import Orbit, sharp_size
+from mipmap_plugin.scenes.photographed import sizes
 from mipmap_plugin.splatting.harmonics import C0
 
 # A view stands in fog, or behind a wall, if more than half of what it shows are splats larger (`sizes`) than FOG of its shorter side. The median is

@@ -14,7 +14,7 @@ from mipmap_plugin.camera import Camera, viewmat_of
 from mipmap_plugin.effects import NEAR_PLANE
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.scenes.photographed import GOLDEN, SEEN_OPACITY, photographed, seen_ways
+from mipmap_plugin.scenes.photographed import GOLDEN, SEEN_OPACITY, photographed, seen_ways, sizes
 
 ORBIT_FOV = math.radians(50)  # along the shorter side: a normal lens
 
@@ -180,11 +180,6 @@ def sharp_size(gaussians: Gaussians) -> float:
     away = (gaussians.means[seen] - gaussians.means[seen].median(dim=0).values).norm(dim=1)
     inner = away <= _quantile(away, INNER)
     return float(sizes(gaussians.detach())[seen][inner].median())
-
-
-def sizes(gaussians: Gaussians) -> Tensor:
-    """The size of each splat, [N] in world units: the geometric mean of its two longer axes (standard deviations)."""
-    return gaussians.scales.topk(2, dim=1).values.prod(dim=1).sqrt()
 
 
 def guess_up(means: Tensor) -> tuple[float, float, float] | None:
