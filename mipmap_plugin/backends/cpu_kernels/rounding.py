@@ -10,10 +10,7 @@ from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, fma, lowest_bit, max
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, row_of, store
 from mipmap_plugin.backends.cpu_kernels.patches import BATCH, find_patches, new_found
 from mipmap_plugin.backends.cpu_kernels.planes import PATCH, PLANE, distances, new_state, offset_of
-from mipmap_plugin.backends.cpu_kernels.powers import exp2
-
-# 1.5 · 2^23: adding it to a float32 and subtracting it again rounds to the nearest integer.
-ROUNDER = 12582912.0
+from mipmap_plugin.backends.cpu_kernels.powers import ROUNDER, exp2
 
 
 @kernel
