@@ -115,6 +115,11 @@ def sizes(gaussians: Gaussians) -> Tensor:
     return gaussians.scales.topk(2, dim=1).values.prod(dim=1).sqrt()
 
 
+def quantile(values: Tensor, share: float) -> Tensor:
+    """The value below which `share` of the first dimension lies. torch.quantile refuses more than 16 million values."""
+    return values.kthvalue(max(1, round(share * len(values))), dim=0).values
+
+
 def _telling(splats: Gaussians) -> Gaussians | None:
     """An even sample of the splats that can be seen and whose colors depend on the view, in double precision; None where there are too few."""
     if splats.covariances is not None or splats.sh.shape[1] < 2:
@@ -139,7 +144,7 @@ def _focal(splats: Gaussians, center: Tensor, eyes: Tensor, half_fov: float) -> 
     if not shown.any():
         return 0.0
     pixels = sizes(splats)[shown] / closest[shown]
-    smallest = pixels.kthvalue(max(1, round(SMALLEST * len(pixels)))).values.item()
+    smallest = quantile(pixels, SMALLEST).item()
     return min(LONGEST, 1 / smallest) if smallest > 0 else LONGEST
 
 
