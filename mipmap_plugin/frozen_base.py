@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -134,7 +133,7 @@ class FrozenBase:
         check_image(camera.width * supersampling, camera.height * supersampling, self.model.parameters()["means"].device)
         backend, _ = self.backend(screen_filter=screen_filter, viewer=viewer)
         form = self._smoothed if options.get("filter_3d") else None
-        with threads.limited(self.threads, shared=False) if self.threads is not None else nullcontext():
+        with threads.limited_for(backend, self.threads):
             return render_model(self.read_by(viewer), backend, camera, effects, form, options.get("clamped", False))
 
     def _smoothed(self, gaussians: Gaussians) -> Gaussians:

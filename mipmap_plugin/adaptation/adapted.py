@@ -14,6 +14,7 @@ from mipmap_plugin.adaptation import notebook
 from mipmap_plugin.adaptation.in_viewers import psnr_per_viewer
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, Validation
+from mipmap_plugin.adaptation.parallel import large_for_torch
 from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.warn import warn
@@ -33,6 +34,7 @@ from mipmap_plugin.models.loaders import for_loader_of, unread
 from mipmap_plugin.models.outputs import cut_off, drawn_otherwise, parts_of, without_place
 from mipmap_plugin.models.places import REPORT, page_of
 from mipmap_plugin.plugin_errors import naming_any, unchanged
+from mipmap_plugin.process import threads
 from mipmap_plugin.process.torch_modes import in_usual_modes, usual_modes
 from mipmap_plugin.progress import announced
 
@@ -192,9 +194,16 @@ def render_model(
 
     `clamped`: whether each of several samples of a pixel is clamped before their mean is taken.
     """
+    with threads.limited_for(backend, None):
+        return _rendered(model, backend, camera, effects, form, clamped)
+
+
+def _rendered(
+    model: SplatModel, backend: Backend, camera: Camera, effects: Effects, form: Callable[[Gaussians], Gaussians] | None, clamped: bool
+) -> Rendered:
     matrix = model.traits.exposures.of(camera) if effects.exposure else None
     family = f"family {model.family!r}"
-    with naming_any({family: model}), unchanged(family, tensors_of(model)):
+    with naming_any({family: model}), unchanged(family, tensors_of(model)), large_for_torch(model.parameters()["means"]):
         gaussians = contract.checked_splats(model, supersample.of_samples(camera, effects.supersampling))
     gaussians = gaussians if form is None else form(gaussians)
     rendered = supersample.render(backend, gaussians, camera, effects, clamped=clamped)

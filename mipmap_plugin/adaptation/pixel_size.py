@@ -106,6 +106,16 @@ def seen_pixel_size(means: Tensor, views: Sequence[Camera], near: float) -> Tens
     return seen[seen.isfinite()]
 
 
+def seen_depth(view: Camera, means: Tensor, near: float, part: float) -> float:
+    """The depth, world units, before which this part of the splats at `means` [N, 3] in a view's picture lies; infinity if none is in it.
+
+    What is not farther than `near` is not in it.
+    """
+    points = view.to_camera(means)
+    depths = points[view.in_picture(points, near), 2]
+    return float(depths.kthvalue(1 + int(part * (len(depths) - 1))).values) if len(depths) else math.inf
+
+
 def _closest_of(means: Tensor, views: Sequence[Camera], count: int | None = None) -> int:
     """The number of views among which the closest one is looked for."""
     return min(MOST_VIEWS, CLOSEST_OF * (count or enough_views(means, views)))

@@ -13,6 +13,9 @@ from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import plural
 from mipmap_plugin.formats.here import size_in_bytes
 
+# Viewers of three.js, for which a ladder's module is told of.
+OF_THREE_JS = ("spark", "three")
+
 
 def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path] = (), json: bool = False) -> None:
     """Print a ladder's manifest, as JSON or in lines."""
@@ -48,12 +51,17 @@ def _left_out(manifest: dict[str, Any]) -> list[str]:
 
 
 def _zooms(folder: Path, manifest: dict[str, Any]) -> list[str]:
+    from mipmap_plugin.levels.manifest import THREE_JS
+    from mipmap_plugin.splatting.viewers import own_name
+
     lines = [f"{folder}, for {manifest['viewer']}: {plural(len(manifest['levels']), 'level')}"]
     for level in manifest["levels"]:
         ends = {"down to": level["shown_from"], "up to": level["shown_to"]}
         shown = ", ".join(f"{word} x{zoom:.3g}" for word, zoom in ends.items() if zoom is not None) or "at every zoom"
         quality = " to ".join(dict.fromkeys(f"{of(level['psnr_db'].values()):.1f}" for of in (min, max)))
         lines.append(f"  {level['file']}  x{level['scale']:.3g}, shown {shown}: {quality} dB, {_size(level)}")
+    if own_name(manifest["viewer"]) in OF_THREE_JS:
+        lines.append(f"  {folder / THREE_JS}  shows the level that fits, in pages of three.js")
     return lines
 
 

@@ -34,6 +34,7 @@ from mipmap_plugin.evaluation.other_scene import of_another_scene, of_another_si
 from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView
 from mipmap_plugin.evaluation.shots import Recorder, Shot, Watcher
+from mipmap_plugin.process import threads
 from mipmap_plugin.progress import Bar
 from mipmap_plugin.recipes import most_steps
 from mipmap_plugin.recipes import recipe as make_config
@@ -90,6 +91,10 @@ class Evaluator:
 
     def row(self, name: str, scale: float, show: RenderView, **facts: Any) -> Row:
         """The mean quality of `show(camera at the base scale)` over the views. PSNRs of views are averaged, as in the literature."""
+        with threads.limited(None, shared=True):  # small images take many times as long on torch's threads where the machine is busy
+            return self._row(name, scale, show, facts)
+
+    def _row(self, name: str, scale: float, show: RenderView, facts: dict[str, Any]) -> Row:
         psnrs, similarities, distances = [], [], []
         watch = warm_stopwatch(show, self.views[0].camera)
         for view in Bar(self.views, desc=f"{name} x{scale:g}", leave=False):
@@ -98,7 +103,8 @@ class Evaluator:
             image, truth = self.protocol.as_saved(image), view.truth(scale, self.protocol).to(image)
             psnrs.append(psnr(image, truth))
             similarities.append(ssim(image, truth))
-            distances.append(self.perceptual(image, truth) if self.perceptual else None)
+            with threads.lent_to_torch():  # for a network
+                distances.append(self.perceptual(image, truth) if self.perceptual else None)
             if self.watcher and view is self.views[0]:
                 self.watcher.shot(Shot(name, self.scene, scale, view.camera, image, truth, psnrs[0], similarities[0], distances[0]))
         label = self.perceptual.label if self.perceptual else ""

@@ -58,7 +58,7 @@ def make_levels(base: FrozenBase, request: LadderRequest, resume: str | Path | N
     base.refuse_undrawn()
     if by_distance(base, request):
         return make_levels_by_distance(base, request, folder)
-    with threads.limited(base.threads, shared=False):
+    with threads.limited_for(base.backend(viewer=request.viewer)[0], base.threads):
         return _make_levels_by_zoom(base, request, folder)
 
 

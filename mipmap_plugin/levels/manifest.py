@@ -1,16 +1,22 @@
-"""`levels.json`: what a ladder's files are, when each is to be shown, and how good it then is. For anybody who writes a viewer or a converter."""
+"""`levels.json`: what a ladder's files are, when each is to be shown, and how good it then is. For anybody who writes a viewer or a converter.
+
+`levels.js` beside it is such a viewer, for pages of three.js.
+"""
 
 from __future__ import annotations
 
+import math
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, median
 from typing import Any
 
 from mipmap_plugin.adaptation.adapted import Adapted
-from mipmap_plugin.adaptation.pixel_size import pixel_size, seen_pixel_size
+from mipmap_plugin.adaptation.pixel_size import pixel_size, seen_depth
 from mipmap_plugin.adaptation.report import Report
+from mipmap_plugin.camera import evenly
 from mipmap_plugin.formats.atomic import new_folder, refuse_output, refuse_to_lose, refuse_unwritable, sha256, write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.frozen_base import FrozenBase
@@ -24,8 +30,14 @@ FORMAT = "mipmap_plugin levels 1"
 # px: the shorter side of the canvas that distances are computed for, unless another is given; they are in proportion to it.
 CANVAS = 1080
 
+# Views that tell what they look at, by so many splats at most.
+LOOKED_AT, SAMPLE = 64, 100_000
+
+# A module for pages of three.js, such as Spark's, that shows the level that fits.
+THREE_JS = "levels.js"
+
 # What is written into the folder of a ladder, also by what converts one.
-WRITTEN = (MANIFEST, "level_*.ply", f"level_*.ply{REPORT}", "report.html", "streamed/*", "tiles/*")
+WRITTEN = (MANIFEST, THREE_JS, "level_*.ply", f"level_*.ply{REPORT}", "report.html", "streamed/*", "tiles/*")
 
 
 def refuse_ladder(folder: Path, base: FrozenBase, *, overwrite: bool, room: int = 0) -> None:
@@ -44,7 +56,10 @@ def write_levels(levels: Sequence[Adapted], manifest_of: Callable[[list[Path]], 
     OutputError."""
     with new_folder(folder, overwrite) as temporary:
         files = [level.save(temporary / f"level_{number}.ply") for number, level in enumerate(levels)]  # 0 is the finest, as in other tools
-        write_json(temporary / MANIFEST, manifest_of(files), overwrite=False)
+        manifest = manifest_of(files)
+        write_json(temporary / MANIFEST, manifest, overwrite=False)
+        if "middle" in manifest:  # the module shows ladders by zoom
+            shutil.copyfile(Path(__file__).with_name(THREE_JS), temporary / THREE_JS)
     return folder
 
 
@@ -63,6 +78,7 @@ def manifest(ladder: Contents, files: list[Path]) -> dict[str, Any]:
         "least_db": ladder.request.least_db,
         "base": first.base,
         "base_pixel": base_pixel(ladder.base),
+        "middle": ladder.levels[0].adapted.model.parameters()["means"].detach().median(dim=0).values.tolist(),
         "levels": [_entry(ladder, number, file) for number, file in enumerate(files)],
         "left_out": [asdict(level) for level in ladder.left_out],
         "switches": [asdict(switch) for switch in ladder.switches],
@@ -75,10 +91,14 @@ def manifest(ladder: Contents, files: list[Path]) -> dict[str, Any]:
 
 
 def base_pixel(base: FrozenBase) -> float:
-    """The size in world units of a pixel of the base at its median splat of those in a picture, in the closest view; of all, if none is."""
-    means, views = base.model.parameters()["means"].detach(), base.views()
-    seen = seen_pixel_size(means, views, base.effects().near_plane)
-    return float((seen if len(seen) else pixel_size(means, views)).median())
+    """The size in world units of a pixel of the base at what its views look at: the median over views, each at the median splat of its picture.
+
+    Where no picture has any, at the median splat of all.
+    """
+    means, near = base.model.parameters()["means"].detach(), base.effects().near_plane
+    means, views = means[:: 1 + len(means) // SAMPLE], evenly(base.views(), LOOKED_AT)
+    sizes = [seen_depth(view, means, near, 1 / 2) / math.sqrt(view.fx * view.fy) for view in views]
+    return median(filter(math.isfinite, sizes)) if min(sizes) < math.inf else float(pixel_size(means, views).median())
 
 
 def _entry(ladder: Contents, number: int, file: Path) -> dict[str, Any]:

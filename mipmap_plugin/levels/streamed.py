@@ -29,7 +29,6 @@ from mipmap_plugin.formats.streamed_sog import Chunk, read_chunks, write_streame
 from mipmap_plugin.levels.distance.chunks import box_distances, shrunk
 from mipmap_plugin.levels.exported import readable
 from mipmap_plugin.levels.manifest import CANVAS, read_manifest
-from mipmap_plugin.models import load_model
 from mipmap_plugin.scenes.photographed import even_directions
 
 STREAMED, SETTINGS = "streamed", "playcanvas.json"
@@ -69,16 +68,16 @@ class Approach:
     splats: Tensor  # [C], of the finest level
 
     @classmethod
-    def to(cls, middle: Tensor, chunks: Sequence[Chunk]) -> Approach:
-        """To the `middle` [3] of the finest level's splats, world units."""
+    def to(cls, middle: Sequence[float], chunks: Sequence[Chunk]) -> Approach:
+        """To the `middle` (x, y, z) of the finest level's splats, world units."""
         low, high = (torch.tensor([getattr(chunk, end) for chunk in chunks], dtype=torch.float64) for end in ("low", "high"))
         splats = torch.tensor([chunk.splats[0] for chunk in chunks], dtype=torch.float64)
-        return cls(middle.double(), *shrunk(low, high), splats)
+        return cls(torch.tensor(middle, dtype=torch.float64), *shrunk(low, high), splats)
 
     @classmethod
-    def to_box(cls, middle: Tensor, low: Tensor, high: Tensor) -> Approach:
-        """To the `middle` [3] in a single box between two corners [3], world units."""
-        return cls(middle.double(), low.double()[None], high.double()[None], torch.ones(1, dtype=torch.float64))
+    def to_box(cls, middle: Sequence[float], low: Tensor, high: Tensor) -> Approach:
+        """To the `middle` (x, y, z) in a single box between two corners [3], world units."""
+        return cls(torch.tensor(middle, dtype=torch.float64), low.double()[None], high.double()[None], torch.ones(1, dtype=torch.float64))
 
     def chunk_distance(self, distance: float) -> float:
         """The distance of the chunks from a camera so far from the middle, world units: the median over splats and directions."""
@@ -156,11 +155,6 @@ def write_streamed(folder: Path, canvas: int = CANVAS) -> Path:
         extent = manifest.get("chunk_extent", max(1, round(EXTENT * rising[0])))
         files = [level["file"] for level in manifest["levels"]]
         write_streamed_sog([readable(folder / file, Path(copies, file)) for file in files], made, extent)
-        approach = None if manifest.get("by") == "distance" else Approach.to(middle_of(folder / files[0]), read_chunks(made))
+        approach = None if manifest.get("by") == "distance" else Approach.to(manifest["middle"], read_chunks(made))
         write_json(temporary / SETTINGS, viewer_settings(manifest, approach, canvas), overwrite=False)
     return folder / STREAMED / LOD_META
-
-
-def middle_of(finest: Path) -> Tensor:
-    """The middle [3] of the finest level's splats, world units."""
-    return load_model(finest).parameters()["means"].detach().median(dim=0).values

@@ -31,7 +31,7 @@ from mipmap_plugin.formats.gltf import SPLATTING, SPZ_INSIDE
 from mipmap_plugin.formats.splat_transform import write_exchange
 from mipmap_plugin.levels.exported import readable
 from mipmap_plugin.levels.manifest import CANVAS, read_manifest
-from mipmap_plugin.levels.streamed import Approach, distances, middle_of
+from mipmap_plugin.levels.streamed import Approach, distances
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.outputs import cut_off, refuse_far
@@ -140,7 +140,7 @@ def write_tiles(folder: Path, canvas: int = CANVAS) -> Path:
     manifest = read_manifest(folder)
     files = [folder / level["file"] for level in manifest["levels"]]
     low, high = bounds(map(load_model, files))
-    approach = None if manifest.get("by") == "distance" else Approach.to_box(middle_of(files[0]), low, high)
+    approach = None if manifest.get("by") == "distance" else Approach.to_box(manifest["middle"], low, high)
     with new_folder(folder / TILES, overwrite=False) as temporary:
         for number, file in enumerate(files):
             write_tile(file, temporary / f"level_{number}.glb")

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from mipmap_plugin import Camera
+from mipmap_plugin.levels.manifest import THREE_JS
 
 HERE = Path(__file__).parent
 
@@ -110,11 +111,22 @@ class Browser:
     def stream(self, viewer: str, folder: Path, component: dict[str, Any], **settings: Any) -> Page:
         """A folder of Streamed SOG in a viewer; `component`: settings of its splats, such as lodBaseDistance; `settings` as for `open`."""
         page, of_name = VIEWERS[viewer]
-        url = f"/files/{len(self._files)}"
-        self._files[url] = Path(folder)
+        url = self._served(folder)
         shown = self._started(page, {**of_name, **settings})
         _told(viewer, shown, "([url, component]) => viewer.open(url, component)", [f"{url}/lod-meta.json", component])
         return Page(viewer, shown)
+
+    def ladder(self, folder: Path) -> Page:
+        """The folder of a ladder in Spark, by the module for three.js in it."""
+        url, shown = self._served(folder), self._started("spark-levels", {})
+        _told("spark", shown, "url => viewer.open(url)", f"{url}/{THREE_JS}")
+        return Page("spark", shown)
+
+    def _served(self, folder: Path) -> str:
+        """The address of a folder."""
+        url = f"/files/{len(self._files)}"
+        self._files[url] = Path(folder)
+        return url
 
     def visit(self, url: str) -> Any:
         """A new page at an address of this machine."""
@@ -146,6 +158,15 @@ class Page:
     def levels(self) -> list[int]:
         """How many splats of each level the last picture has, of a streamed file."""
         return list(_told(self._viewer, self._shown, "() => viewer.levels()", None))
+
+    def shown(self) -> tuple[int, float]:
+        """Which level of a ladder in Spark the last picture shows, and at which zoom."""
+        level, zoom = _told(self._viewer, self._shown, "() => viewer.shown()", None)
+        return int(level), float(zoom)
+
+    def place(self, position: Sequence[float], quaternion: Sequence[float], scale: float) -> None:
+        """Put a ladder in Spark at a position, turned by a quaternion (x, y, z, w) and enlarged."""
+        _told(self._viewer, self._shown, "place => viewer.place(...place)", [list(position), list(quaternion), scale])
 
     def _view(self, camera: Camera, background: Sequence[float]) -> np.ndarray:
         matrices = {"projection": projection(camera), "viewmat": opengl(camera)}

@@ -17,7 +17,7 @@ from mipmap_plugin.commands.ladder_summary import print_summary
 from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.levels.contents import LeftOut, Level
 from mipmap_plugin.levels.ladder import NO_FEWER, NOT_BETTER, UNSHOWN, _no_use, _shown, _Work, make_levels
-from mipmap_plugin.levels.manifest import MANIFEST, base_pixel, refuse_ladder
+from mipmap_plugin.levels.manifest import MANIFEST, THREE_JS, base_pixel, read_manifest, refuse_ladder
 from mipmap_plugin.levels.request import MERGING_COSTS, Band
 from mipmap_plugin.models.places import state_path
 from mipmap_plugin.models.vanilla import VanillaModel
@@ -146,6 +146,13 @@ def test_splats_in_no_picture_have_no_part_in_the_size_of_a_pixel():
     assert sizes[0] == sizes[1] and 0 < sizes[2] < sizes[0] / 5
 
 
+def test_the_views_of_the_training_are_at_x1_by_what_they_look_at():
+    """Not by what is closest to one of them: viewers would change levels nearer than these are measured."""
+    views, ball = [camera.zoomed(scale) for camera, scale in zip(tiny.cameras(3), (1, 1, 2), strict=True)], tiny.gaussians(500, spread=0.3)
+    away = float((views[0].center - ball.means.double().median(0).values).norm())
+    assert base_pixel(wrap_model(VanillaModel.from_gaussians(ball), cameras=views)) == pytest.approx(away / views[0].fx, rel=0.05)
+
+
 def test_a_ladder_is_saved_when_its_base_is_gone(tmp_path):
     base = tiny.ply(tmp_path / "base.ply", degree=0)
     ladder = wrap_model(base, cameras=tiny.cameras(2, width=16, height=12)).levels("classic", coarsest=1.0)
@@ -177,6 +184,20 @@ def test_the_command_tells_of_generated_views_and_the_size_of_a_small_level_in_k
     assert cli.main([*words, "--backend", "cpu", "--threads", "1"]) == 0
     said, size = capsys.readouterr(), json.loads((tmp_path / "ladder/levels.json").read_text())["levels"][0]["bytes"]
     assert ("no cameras are known" in said.err) is not has_cameras and f" splats, {size / 1e3:.0f} kB, " in said.out
+
+
+@pytest.mark.parametrize(
+    ("viewer", "by", "lies", "told"), [("spark", "zoom", True, True), ("classic", "zoom", True, False), ("spark", "distance", False, False)]
+)
+def test_a_ladder_by_zoom_has_the_module_for_three_js(tmp_path, capsys, viewer, by, lies, told):
+    """And what it needs to know of the scene. It is told of for viewers of three.js."""
+    base, ladder = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12)), tmp_path / "ladder"
+    words = ["levels", str(base), "--viewer", viewer, "--by", by, "--output", str(ladder), "--coarsest", "1/2", "--steps", "1", "--views", "given"]
+    assert cli.main(words) == 0
+    assert (ladder / THREE_JS).is_file() is lies and (str(ladder / THREE_JS) in capsys.readouterr().out) is told
+    if lies:
+        means = load_model(ladder / "level_0.ply").parameters()["means"]
+        assert read_manifest(ladder)["middle"] == pytest.approx(means.median(0).values.tolist())
 
 
 def test_a_ladder_in_memory_keeps_no_truths():

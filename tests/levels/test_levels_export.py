@@ -114,7 +114,7 @@ def test_streamed_sog_is_written_with_its_levels_and_settings(ladder, tool):
     assert words[-9:] == [word for number in range(3) for word in (str(ladder / f"level_{number}.ply"), "--tag-lod", str(number))]
     assert words[words.index("--lod-chunk-extent") + 1] == str(round(EXTENT * distances(LADDER, 1000)[0]))
     assert read_chunks(made) == CHUNKS
-    approach = Approach.to(tiny.gaussians().means.median(0).values, CHUNKS)
+    approach = Approach.to(LADDER["middle"], CHUNKS)
     assert json.loads((made.parent / "playcanvas.json").read_text()) == viewer_settings(LADDER, approach, 1000)
     with pytest.raises(OutputExists):
         write_streamed(ladder)

@@ -12,7 +12,7 @@ from mipmap_plugin.levels.distance.chunks import box_distances
 from mipmap_plugin.levels.streamed import DIRECTIONS, Approach, distances, progression, viewer_settings
 from mipmap_plugin.levels.tiles import SCREEN_ERROR, bounding_box, bounds, errors, tileset
 
-APPROACH = Approach.to(torch.tensor([2.0, 0.5, 0.5]), CHUNKS)
+APPROACH = Approach.to([2.0, 0.5, 0.5], CHUNKS)
 
 
 def test_a_switch_lies_at_the_distance_where_a_base_pixel_has_its_zoom():
@@ -37,7 +37,7 @@ def test_distances_too_close_for_playcanvas_are_spread_around_their_middle():
 def test_of_a_chunk_that_one_splat_far_away_makes_long_the_nearer_end_counts():
     """Its middle is 500 units away, but hardly any direction brings that nearer to a camera than its splats."""
     boxes = [Chunk((-1, -1, -1), (0, 1, 1), (20, 0, 0)), Chunk((0, -1, -1), (1, 1, 1), (10, 0, 0)), Chunk((0, -1, -1), (1000, 1, 1), (20, 0, 0))]
-    usual, long = (Approach.to(torch.zeros(3), some) for some in (boxes[:2], boxes))
+    usual, long = (Approach.to([0.0, 0.0, 0.0], some) for some in (boxes[:2], boxes))
     assert usual.chunk_distance(10) == pytest.approx(10 - 1.25, abs=0.25)
     assert 10 - 1.5 < long.chunk_distance(10) < 10
     assert long.camera_distance(long.chunk_distance(10)) == pytest.approx(10, rel=1e-3)
@@ -68,7 +68,7 @@ def test_what_playcanvas_takes_for_levels_by_distance_of_a_scene_in_small_units_
 def test_a_tile_is_replaced_at_its_switch():
     """Where a base pixel of 0.01 units at the scene's middle is seen with 0.7 px, the error of the tile that is replaced there has 16 at its box."""
     focal, box = 500 / math.tan(math.radians(22.5)), (torch.tensor([-3.0, -4.0, -5.0]), torch.tensor([3.0, 4.0, 5.0]))
-    approach = Approach.to_box(torch.zeros(3), *box)
+    approach = Approach.to_box([0.0, 0.0, 0.0], *box)
     finest, *coarser = errors(LADDER, approach, 1000)
     assert finest == 0
     for error, zoom in zip(coarser, (0.7, 0.35), strict=True):
@@ -79,7 +79,7 @@ def test_a_tile_is_replaced_at_its_switch():
 
 def test_a_tile_that_reaches_far_beyond_its_scene_is_replaced_all_the_same():
     """A camera inside the box is at no distance from it, at which Cesium would never show a coarser level."""
-    approach = Approach.to_box(torch.zeros(3), torch.full((3,), -1e3), torch.full((3,), 1e3))
+    approach = Approach.to_box([0.0, 0.0, 0.0], torch.full((3,), -1e3), torch.full((3,), 1e3))
     assert errors(LADDER, approach, 1000)[1:] == pytest.approx([SCREEN_ERROR * 0.01 / zoom / 2 for zoom in (0.7, 0.35)])
 
 

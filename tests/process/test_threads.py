@@ -211,18 +211,20 @@ def test_what_a_command_measures_has_the_threads_that_were_asked_for(tmp_path):
         assert torch.get_num_threads() == 2
 
 
-def test_a_wrapped_model_renders_with_its_own_threads():
+@pytest.mark.parametrize(("backend", "torchs"), [("cpu", 1), ("reference", 3)])
+def test_a_wrapped_model_renders_with_its_own_threads(backend, torchs):
+    """A backend's kernels have them, and torch one: its threads would wait for one another on a busy machine, 20 times as long as one takes."""
     before, seen = torch.get_num_threads(), []
 
     class Watched(type(tiny.model(2))):
         def gaussians(self, camera=None):
-            seen.append(torch.get_num_threads())
+            seen.append((torch.get_num_threads(), threads.for_kernels()))
             return super().gaussians(camera)
 
     model = tiny.model(20)
     model.__class__ = Watched
-    wrap_model(model, cameras=tiny.cameras(1), backend="cpu", threads=before + 1).render(tiny.cameras(1)[0])
-    assert seen[-1] == before + 1 and torch.get_num_threads() == before
+    wrap_model(model, cameras=tiny.cameras(1), backend=backend, threads=3).render(tiny.cameras(1)[0])
+    assert seen[-1] == (torchs, 3) and torch.get_num_threads() == before
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")

@@ -24,6 +24,7 @@ from mipmap_plugin.evaluation.measure import BASE, FILTERS, Baseline, RenderView
 from mipmap_plugin.evaluation.tradeoff.points import NOTHING, Plan, Point, Spread
 from mipmap_plugin.evaluation.tradeoff.truth import GroundTruth
 from mipmap_plugin.models.base import SplatModel, count_of
+from mipmap_plugin.process import threads
 from mipmap_plugin.progress import Bar, ticking
 from mipmap_plugin.recipes import most_steps
 from mipmap_plugin.recipes import recipe as make_config
@@ -168,7 +169,7 @@ def left_out(model: Wrapped, plan: Plan) -> list[str]:
 def _measured(point: Point, show: RenderView, truth: GroundTruth, repeats: int) -> Point:
     """Measure the PSNR and the milliseconds per frame of a point: the means over the views in each repeat."""
     times, psnrs = [], []
-    with torch.no_grad():
+    with torch.no_grad(), threads.limited_for(get_backend(point.backend), None):
         watch = warm_stopwatch(show, truth.views[0])
         for repeat in range(repeats):
             watch.seconds = 0.0

@@ -14,7 +14,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.pixel_size import pixel_size
+from mipmap_plugin.adaptation.pixel_size import pixel_size, seen_depth
 from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
 from mipmap_plugin.adaptation.target.resize import resize
@@ -42,9 +42,7 @@ def backed(view: Camera, way: float) -> Camera:
 
 def foreground(view: Camera, means: Tensor, near: float) -> float:
     """The depth of the nearest parts of a view, in world units; infinity where it sees nothing. `means` [N, 3]."""
-    points = view.to_camera(means)
-    depths = points[view.in_picture(points, near), 2]
-    return float(depths.kthvalue(1 + int(FOREGROUND * (len(depths) - 1))).values) if len(depths) else torch.inf
+    return seen_depth(view, means, near, FOREGROUND)
 
 
 class WalkTruth:

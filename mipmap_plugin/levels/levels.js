@@ -1,0 +1,78 @@
+// Shows a ladder of levels in three.js: in each frame the level that fits how large a pixel is at the scene. It was written by mipmap_plugin
+// with levels.json and the level files, which lie beside it. With Spark:
+//
+//     const levels = await Levels.load(async (url) => {
+//       const splats = new SplatMesh({ url })
+//       await splats.initialized
+//       return splats
+//     })
+//     levels.quaternion.set(1, 0, 0, 0) // most files have y down
+//     scene.add(levels)
+//     renderer.setAnimationLoop(() => {
+//       levels.update(camera, renderer)
+//       renderer.render(scene, camera)
+//     })
+
+import { Group, Vector2, Vector3 } from 'three'
+
+// A level stays until the zoom is so much beyond its switch, so that nothing flickers where a camera rests.
+const STAYS = 1.02
+
+export class Levels extends Group {
+  // `open`: makes of the URL of a level's file what draws it, an Object3D. `folder`: URL of the ladder, this module's by default.
+  static async load(open, folder = new URL('.', import.meta.url)) {
+    const answer = await fetch(new URL('levels.json', folder))
+    if (!answer.ok) throw new Error(`${answer.url}: ${answer.status} ${answer.statusText}`)
+    const levels = new Levels(await answer.json(), (file) => open(new URL(file, folder).href))
+    await levels.opened(levels.wanted)
+    return levels
+  }
+
+  // `manifest`: levels.json; `open`: makes what draws a level of its file's name.
+  constructor(manifest, open) {
+    super()
+    this.manifest = manifest
+    this.open = open
+    this.drawn = manifest.levels.map(() => null) // what draws each level, once it is there
+    this.opening = manifest.levels.map(() => null)
+    this.wanted = manifest.levels.length - 1 // the coarsest, which is the first to be there
+    this.shown = this.wanted
+  }
+
+  // To be called before each frame. A level is loaded when it is wanted first; until it is there the nearest one is shown.
+  update(camera, renderer) {
+    const zoom = this.zoom(camera, renderer)
+    const stays = [this.fitting(zoom * STAYS), this.fitting(zoom / STAYS)].includes(this.wanted)
+    if (!stays) this.wanted = this.fitting(zoom)
+    if (!this.opening[this.wanted]) this.opened(this.wanted).catch(console.error)
+    const there = this.drawn.flatMap((splats, level) => (splats ? [level] : []))
+    this.shown = there.reduce((best, each) => (Math.abs(each - this.wanted) < Math.abs(best - this.wanted) ? each : best), there[0])
+    this.drawn.forEach((splats, level) => splats && (splats.visible = level === this.shown))
+  }
+
+  // How large the middle of the scene is on the canvas, over how large it was in training.
+  zoom(camera, renderer) {
+    this.updateWorldMatrix(true, false)
+    camera.updateWorldMatrix(true, false)
+    const middle = new Vector3(...this.manifest.middle).applyMatrix4(this.matrixWorld)
+    const projection = camera.projectionMatrix.elements // by columns: 5 is twice the focal length over the height, 15 is 1 without perspective
+    const distance = projection[15] === 1 ? 1 : middle.distanceTo(new Vector3().setFromMatrixPosition(camera.matrixWorld))
+    const pixel = (2 * distance) / (projection[5] * renderer.getDrawingBufferSize(new Vector2()).y)
+    return (this.manifest.base_pixel * new Vector3().setFromMatrixScale(this.matrixWorld).x) / pixel
+  }
+
+  // The number of the level that is to be shown at a zoom: 0 is the finest.
+  fitting(zoom) {
+    return this.manifest.switches.filter((each) => zoom < each.zoom).length
+  }
+
+  // Resolves once a level is there.
+  opened(level) {
+    this.opening[level] ??= this.open(this.manifest.levels[level].file).then((splats) => {
+      splats.visible = false
+      this.drawn[level] = splats
+      this.add(splats)
+    })
+    return this.opening[level]
+  }
+}
