@@ -81,6 +81,11 @@ class Effect:
         return f"{self.name}: {'on' if self.on else 'off'}, {self.reason} ({'costs' if self.on else 'saves'} {self.cost})"
 
 
+def colorless(effects: Effects) -> Effects:
+    """The same for images whose colors, SH of degree 0, are other quantities: on black, and without limits, rounding and light of colors."""
+    return replace(effects, sh_degree=0, background=(0.0, 0.0, 0.0), settings=effects.settings.without_color_rounding())
+
+
 EXPOSURE = Effect("exposure", False, "the checkpoint has none", "a product with a 3 x 3 matrix per pixel")
 
 # Effects of some families only; a model reports those that it has (`models.base.effects_of`).

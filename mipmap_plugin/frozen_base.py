@@ -94,9 +94,11 @@ class FrozenBase:
             if screen_filter is not None:
                 raise SettingsError(f"viewer {viewer} has a screen filter of its own; leave the screen filter {screen_filter} out")
             return find_viewer(viewer).effects(own)
+        if screen_filter is None:
+            return own
         scaled = replace(own, eps2d=trained.eps2d * scale**2)
-        if screen_filter in (None, "scaled"):
-            return own if screen_filter is None else scaled
+        if screen_filter == "scaled":
+            return scaled
         check_screen_filter(screen_filter, "scaled", trained.screen_filter)
         if screen_filter in INTEGRALS and trained.screen_filter == "classic":
             return replace(scaled, screen_filter=screen_filter)

@@ -23,7 +23,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 # From the ground up; a module imports only what lies below its own storey, or in its own package.
 STOREYS = [
     {"errors"},
-    {"limits", "process"},
+    {"limits", "process", "morton"},
     {"registry", "config", "progress", "screen_filters", "allowed", "plugin_errors"},
     {"render_settings"},
     {"gaussians", "camera"},

@@ -25,6 +25,7 @@ from mipmap_plugin.progress import announced
 from mipmap_plugin.render_settings import MIN_ALPHA
 from mipmap_plugin.scenes import unread_cameras
 from mipmap_plugin.scenes.orbits import FRAMED, Orbit
+from mipmap_plugin.scenes.photographed import quantile
 
 # Views that are looked at to see whether they show anything; and the mean fraction of their splats in front of the near plane that is worth a word.
 # Floaters lie close to cameras, but captures in usual units have no splats there; made ten times smaller they have 2 %, twenty times smaller half.
@@ -199,7 +200,7 @@ def too_small(views: Sequence[Camera], model: SplatModel, near: float, least: fl
         return ""
     center = splats.means.median(dim=0).values
     reach = (splats.means - center).norm(dim=1) + SEEN * splats.scales.abs().amax(1)
-    width = 2 * float(reach.kthvalue(max(1, round(FRAMED * len(reach)))).values)
+    width = 2 * float(quantile(reach, FRAMED))
     middle = center.tolist()
     away = [math.dist(view.center.tolist(), middle) for view in views]
     most = max(width * view.fx / max(distance, near) for view, distance in zip(views, away, strict=True))
@@ -220,7 +221,7 @@ def far_apart(means: Tensor) -> str:
     if len(means) <= CROWDED * ACROSS:
         return ""
     away = (means - means.median(dim=0).values).norm(dim=1)
-    radius = float(away.kthvalue(round(FRAMED * len(away))).values)
+    radius = float(quantile(away, FRAMED))
     if not radius or len((means * (ACROSS / radius)).floor().unique(dim=0)) >= ACROSS:
         return ""
     where = f"the splats are a few things, {units(radius, 2)} units apart, which generated views show as specks"

@@ -15,12 +15,13 @@ from mipmap_plugin.adaptation.target.base_images import facts
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import ONE_PIXEL, Camera, evenly
-from mipmap_plugin.effects import Effects
+from mipmap_plugin.effects import Effects, colorless
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.adapted_scale import adapted_orbit
 from mipmap_plugin.models.base import SplatModel, places
 from mipmap_plugin.process.threads import side_by_side
-from mipmap_plugin.scenes.orbits import Orbit, sharp_size, sizes
+from mipmap_plugin.scenes.orbits import Orbit, sharp_size
+from mipmap_plugin.scenes.photographed import sizes
 from mipmap_plugin.splatting.harmonics import C0
 
 # A view stands in fog, or behind a wall, if more than half of what it shows are splats larger (`sizes`) than FOG of its shorter side. The median is
@@ -86,9 +87,7 @@ class ClearViews:
 
         `backend`: chooses what draws the model (`choose_backend`); a reference to the base, which has this, would keep its memory.
         """
-        self._model, self._backend = model, backend
-        settings = effects.settings.without_color_rounding()
-        self._effects = replace(effects, sh_degree=0, background=(0.0, 0.0, 0.0), settings=settings)
+        self._model, self._backend, self._effects = model, backend, colorless(effects)
         self._known: dict[Hashable, bool] = {}  # by `facts`
 
     @torch.no_grad()

@@ -15,7 +15,7 @@ from torch.nn.functional import normalize
 from mipmap_plugin.backends import supersample
 from mipmap_plugin.backends.base import Backend, Rendered
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import Effects
+from mipmap_plugin.effects import Effects, colorless
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.eigen import eigh3
 from mipmap_plugin.splatting.harmonics import C0
@@ -60,5 +60,4 @@ def facing(gaussians: Gaussians, camera: Camera) -> Tensor:
 def _blended(backend: Backend, gaussians: Gaussians, colors: Tensor, camera: Camera, effects: Effects) -> Rendered:
     """Render with `colors` [N, 3], which are not negative, over black."""
     colored = replace(gaussians, sh=(colors - 0.5)[:, None] / C0)
-    plain = replace(effects, sh_degree=0, background=(0.0, 0.0, 0.0), settings=effects.settings.without_color_rounding())
-    return supersample.render(backend, colored, camera, plain)
+    return supersample.render(backend, colored, camera, colorless(effects))

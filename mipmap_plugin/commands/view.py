@@ -87,15 +87,14 @@ def view(
 
 def _page(wrapped: Wrapped, adapted: tuple[Path, ...], backend: str, settings: PageSettings) -> Page:
     from mipmap_plugin.viewing.page import Page
-    from mipmap_plugin.viewing.sources import File, Supersampled, open_source
+    from mipmap_plugin.viewing.sources import File, Source, Supersampled, open_source
     from mipmap_plugin.viewing.stage import Stage
 
-    others = []
+    sources: list[Source] = [File("base", wrapped)]
     for path in adapted:
         with announced(f"reading {path.name}"):
-            others.append(open_source(path, wrapped, backend))
-    base = File("base", wrapped)
-    return Page(Stage(wrapped, [base, *others], Supersampled("base, supersampled", wrapped)), base, settings)
+            sources.append(open_source(path, wrapped, backend))
+    return Page(Stage(wrapped, sources, Supersampled("base, supersampled", wrapped)), settings)
 
 
 def _choices(wrapped: Wrapped, viewer: str | None) -> tuple[list[str | None], list[str]]:

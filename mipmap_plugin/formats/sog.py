@@ -14,12 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.codebooks import codebook, palette
 from mipmap_plugin.formats.images import lossless_webp
 from mipmap_plugin.formats.tags import DAMAGE, meta_of_sog
 from mipmap_plugin.formats.zipped import FULL
+from mipmap_plugin.morton import morton_codes
 
 # Entries of the table of spherical harmonics: their numbers have 16 bits, and 64 of them lie in a row.
 MOST_ENTRIES, IN_A_ROW = 1 << 16, 64
@@ -45,7 +47,7 @@ def write_sog(path: Path, columns: Mapping[str, np.ndarray], *, antialiased: boo
     weights = opacities * np.exp(np.sort(scales - scales.max(), axis=1)[:, 1:].sum(1))  # what a splat covers, where an error shows
     weights = np.maximum(weights / weights.max(), np.finfo(np.float32).tiny) if weights.max() > 0 else np.ones(count)
     places, low, high = _places(np.stack([columns[axis] for axis in "xyz"], 1).astype(np.float64))
-    order = _morton(places)  # neighbors beside each other are smaller files
+    order = morton_codes(torch.from_numpy(places)).argsort(stable=True).numpy()  # neighbors beside each other are smaller files
     lengths, length = codebook(scales, np.repeat(weights[:, None], 3, 1))
     colors, color = codebook(_stack(columns, "f_dc_{}", 3), np.repeat(weights[:, None], 3, 1))
     alphas = np.rint(opacities * LEVELS).astype(np.uint8)
@@ -157,15 +159,6 @@ def _places(means: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     low, high = logs.min(0), logs.max(0)
     span = np.where(high > low, high - low, 1.0)
     return np.rint((logs - low) / span * PLACES).astype(np.int64), low, high
-
-
-def _morton(places: np.ndarray) -> np.ndarray:
-    """The order of places [N, 3] of 16 bits along a Z-order curve."""
-    keys = np.zeros(len(places), np.int64)
-    for bit in range(16):
-        for axis in range(3):
-            keys |= (places[:, axis] >> bit & 1) << (3 * bit + axis)
-    return np.argsort(keys, kind="stable")
 
 
 def _rotations(quats: np.ndarray) -> np.ndarray:

@@ -29,7 +29,7 @@ from mipmap_plugin.formats.streamed_sog import Chunk, read_chunks, write_streame
 from mipmap_plugin.levels.distance.chunks import box_distances, shrunk
 from mipmap_plugin.levels.exported import readable
 from mipmap_plugin.levels.manifest import CANVAS, read_manifest
-from mipmap_plugin.scenes.photographed import GOLDEN
+from mipmap_plugin.scenes.photographed import even_directions
 
 STREAMED, SETTINGS = "streamed", "playcanvas.json"
 
@@ -38,11 +38,8 @@ SINGLE_LEVEL = "this ladder has a single level, which needs no streaming"
 # The largest extent of a chunk, as a part of the distance of the first switch: its near and its far end are then seen at nearly one zoom.
 EXTENT = 1 / 4
 
-# Directions from which chunks are looked at, unit vectors [D, 3] spread evenly; and the steps that find a distance to a millionth.
-HEIGHTS = 1 - (2 * torch.arange(64, dtype=torch.float64, device="cpu") + 1) / 64
-TURNS = 2 * math.pi * GOLDEN * torch.arange(64, dtype=torch.float64, device="cpu")
-DIRECTIONS = torch.stack([TURNS.cos() * (1 - HEIGHTS**2).sqrt(), TURNS.sin() * (1 - HEIGHTS**2).sqrt(), HEIGHTS], dim=1)
-HALVINGS = 20
+# Directions from which chunks are looked at, unit vectors [D, 3]; and the steps that find a distance to a millionth.
+DIRECTIONS, HALVINGS = even_directions(64), 20
 
 # The splats that PlayCanvas shows at most.
 BUDGET = 1_000_000

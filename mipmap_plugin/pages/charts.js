@@ -47,6 +47,9 @@ function plot({ title, x, y, xTicks, bend = (value) => value, nameOf = String, x
   return { svg, place };
 }
 
+/** The line under a plot that tells the point that is looked at. */
+const newReadout = () => make("p", { class: "readout", "aria-live": "polite" }, "Point at a mark, or tap it, to read it.");
+
 /** A point that tells `text` while the pointer or the keyboard is on it. */
 function point(x, y, name, text, readout) {
   const tell = () => { readout.textContent = text; };
@@ -68,39 +71,38 @@ const path = (points) => `M${points.map((each) => each.map((value) => value.toFi
 /** dB over seconds of one adaptation: what was done before the first step, the steps, and what was taken back. */
 function curveChart(report) {
   const curve = report.curve.filter((each) => each.validation_db != null);
-  const base = Object.entries(report.validation).find(([name]) => name === "the base as it is");
+  const base = report.validation["the base as it is"];
   const last = Math.max(report.seconds.total, ...curve.map((each) => each.seconds));
   const { svg, place } = plot({
-    title: `dB over seconds, ${report.title}`, x: [0, last], y: spread([...curve.map((each) => each.validation_db), ...(base ? [base[1]] : [])]),
+    title: `dB over seconds, ${report.title}`, x: [0, last], y: spread([...curve.map((each) => each.validation_db), ...(base == null ? [] : [base])]),
     xTicks: ticksOf(0, last, 8), xLabel: "seconds of adapting", yLabel: "dB on validation views",
   });
-  const readout = make("p", { class: "readout", "aria-live": "polite" }, "Point at a mark, or tap it, to read it.");
+  const readout = newReadout();
   const start = curve[0];
   const before = Object.entries(report.seconds).filter(([phase, seconds]) => !WITH_STEPS.includes(phase) && seconds >= 0.005)
     .map(([phase, seconds]) => `${phase} ${seconds.toFixed(2)} s`).join(", ");
-  const made = Object.keys(report.validation).find((name) => name.startsWith("the start, "));
+  const made = Object.keys(report.validation).find((name) => name.startsWith("the start, "))?.replace("the start, ", "");
   svg.prepend(draw("rect", { class: "before-steps", x: place.x(0), y: MARGIN.top, width: place.x(start.seconds) - place.x(0), height: HEIGHT - MARGIN.top - MARGIN.bottom }));
-  if (base) {
-    svg.append(draw("line", { class: "base-line", x1: MARGIN.left, x2: WIDTH - MARGIN.right, y1: place.y(base[1]), y2: place.y(base[1]) }));
-    svg.append(draw("text", { x: WIDTH - MARGIN.right, y: place.y(base[1]) - 5, "text-anchor": "end" }, `base ${decibel(base[1])}`));
+  if (base != null) {
+    svg.append(draw("line", { class: "base-line", x1: MARGIN.left, x2: WIDTH - MARGIN.right, y1: place.y(base), y2: place.y(base) }));
+    svg.append(draw("text", { x: WIDTH - MARGIN.right, y: place.y(base) - 5, "text-anchor": "end" }, `base ${decibel(base)}`));
   }
   svg.append(draw("path", { class: "curve", d: path(curve.map((each) => [place.x(each.seconds), place.y(each.validation_db)])) }));
   if (made) {
-    const name = made.replace("the start, ", "");
-    svg.append(draw("text", { class: "start-label", ...beside(place.x(start.seconds), name, 9), y: place.y(start.validation_db) + 16 }, name));
+    svg.append(draw("text", { class: "start-label", ...beside(place.x(start.seconds), made, 9), y: place.y(start.validation_db) + 16 }, made));
   }
   for (const each of curve) {
-    const what = each.step === 0 ? `${made ? made.replace("the start, ", "") : "the start"} (${before || "nothing before it"})`
+    const what = each.step === 0 ? `${made ?? "the start"} (${before || "nothing before it"})`
       : `step ${each.step}${each.taken_back ? ", taken back" : ""}`;
     const text = `${each.seconds.toFixed(2)} s: ${decibel(each.validation_db)}, ${splats(each.gaussians)}, ${what}`;
     const name = each.step === 0 ? "mark start" : each.taken_back ? "mark taken-back" : "mark";
     svg.append(point(place.x(each.seconds), place.y(each.validation_db), name, text, readout));
   }
-  const ends = before ? `Shaded, before the first step: ${before}. ` : "";
+  const shaded = before ? `Shaded, before the first step: ${before}. ` : "";
   const steers = "The curve is of the validation views that steer the run; the base's line and the dB above are of the others. ";
-  const split = base && !Object.values(report.validation).includes(start.validation_db) ? steers : "";
+  const split = base != null && !Object.values(report.validation).includes(start.validation_db) ? steers : "";
   return make("figure", { class: "chart" }, make("figcaption", {}, report.title), svg, readout,
-    make("p", { class: "note" }, `${ends}${split}Ended by ${report.ended_by}; the file holds ${report.returned}.`));
+    make("p", { class: "note" }, `${shaded}${split}Ended by ${report.ended_by}; the file holds ${report.returned}.`));
 }
 
 /** Both fronts of one scale of a tradeoff: dB over seconds to adapt, and over milliseconds a frame. */
@@ -120,24 +122,23 @@ function frontChart(scale, { cost, mark, label, unit, points }) {
     title: `dB over ${label}, ${zoomName(scale.scale)}`, x: least ? [0, high * 1.1] : [low / 1.2, high * 1.2], y: spread(points.map((each) => each.psnr_db.median)),
     xTicks: least ? [0, ...logTicks(least, high)] : logTicks(low, high), bend, xLabel: label, yLabel: "dB",
   });
-  const readout = make("p", { class: "readout", "aria-live": "polite" }, "Point at a mark, or tap it, to read it.");
+  const readout = newReadout();
   const front = points.filter((each) => each[mark]).sort((a, b) => cost(a).median - cost(b).median);
-  const corners = front.flatMap((each, i) => {
-    const here = [place.x(cost(each).median), place.y(each.psnr_db.median)];
-    return i ? [[here[0], place.y(front[i - 1].psnr_db.median)], here] : [here];
-  });
+  const at = (each) => [place.x(cost(each).median), place.y(each.psnr_db.median)];
+  const corners = front.flatMap((each, i) => (i ? [[at(each)[0], at(front[i - 1])[1]], at(each)] : [at(each)]));
   for (const name of new Set(points.map((each) => `${each.name}, ${each.backend}`))) {
     const run = points.filter((each) => `${each.name}, ${each.backend}` === name).sort((a, b) => cost(a).median - cost(b).median);
-    if (run.length > 1) svg.append(draw("path", { class: "run", d: path(run.map((each) => [place.x(cost(each).median), place.y(each.psnr_db.median)])) }));
+    if (run.length > 1) svg.append(draw("path", { class: "run", d: path(run.map(at)) }));
   }
   for (const each of front.filter((one) => one.step == null)) {
-    svg.append(draw("text", { class: "point-label", ...beside(place.x(cost(each).median), each.name, -4), y: place.y(each.psnr_db.median) - 9 }, each.name));
+    const [x, y] = at(each);
+    svg.append(draw("text", { class: "point-label", ...beside(x, each.name, -4), y: y - 9 }, each.name));
   }
   if (corners.length > 1) svg.append(draw("path", { class: "front", d: path(corners) }));
   for (const each of points) {
     const step = each.step == null ? "" : `, step ${each.step}`;
     const text = `${each.name}${step}, ${each.backend}: ${decibel(each.psnr_db.median)}, ${digits(cost(each).median, 2)} ${unit}, ${splats(each.gaussians)}`;
-    svg.append(point(place.x(cost(each).median), place.y(each.psnr_db.median), `mark ${each.kind}${each[mark] ? " on-front" : ""}`, text, readout));
+    svg.append(point(...at(each), `mark ${each.kind}${each[mark] ? " on-front" : ""}`, text, readout));
   }
   return make("figure", { class: "chart" }, make("figcaption", {}, `${zoomName(scale.scale)}: dB over ${label}`), svg, readout);
 }

@@ -20,7 +20,7 @@ function comparison() {
   const viewers = make("div", { id: "viewers" });
 
   function picker(id, side) {
-    return make("select", { id, "aria-label": `picture on the ${side}`, onchange: () => { choose(); } });
+    return make("select", { id, "aria-label": `picture on the ${side}`, onchange: choose });
   }
 
   function choose() {
@@ -80,16 +80,18 @@ function comparison() {
   function go(index) {
     const names = before && [before.name, after.name];
     zoom = record.zooms[index];
-    const found = (name, fallback) => Math.max(0, zoom.pictures.findIndex((each) => each.name === name) + 1 || fallback + 1) - 1;
-    const last = (role) => zoom.pictures.map((each) => each.role).lastIndexOf(role);
-    const first = (role) => zoom.pictures.findIndex((each) => each.role === role);
-    const second = first("adapted") >= 0 ? first("adapted") : zoom.pictures.length - 1;
+    const first = (of, value, otherwise) => {
+      const found = zoom.pictures.findIndex((each) => each[of] === value);
+      return found < 0 ? otherwise : found;
+    };
+    const base = Math.max(0, zoom.pictures.map((each) => each.role).lastIndexOf("base"));
+    const adapted = first("role", "adapted", zoom.pictures.length - 1);
     for (const select of Object.values(selects)) {
       select.replaceChildren(...zoom.pictures.map((each, i) => make("option", { value: i }, each.name)));
     }
     grid.replaceChildren(...zoom.pictures.map((each, i) => card(each, i)));
-    selects.before.value = found(names && names[0], Math.max(0, last("base")));
-    selects.after.value = found(names && names[1], second);
+    selects.before.value = first("name", names?.[0], base);
+    selects.after.value = first("name", names?.[1], adapted);
     const whole = zoom.size.join(" × "), part = zoom.shown.join(" × ");
     caption.textContent = [
       zoom.view && `View ${zoom.view}`, whole === part ? `${whole} px` : `the middle ${part} of ${whole} px`,

@@ -31,7 +31,7 @@ function ladderChart(ladder) {
     title: `dB over ${axis.xLabel}`, x: [axis.of(curve[0]), axis.of(curve.at(-1))], y: spread(curve.flatMap((each) => [each.psnr_db, each.base_db])),
     xTicks: axis.xTicks, nameOf: axis.nameOf, bend: Math.log2, xLabel: axis.xLabel, yLabel: "dB",
   });
-  const readout = make("p", { class: "readout", "aria-live": "polite" }, "Point at a mark, or tap it, to read it.");
+  const readout = newReadout();
   let named = -Infinity; // where the last switch with a name lies
   for (const each of axis.switches) {
     const x = place.x(each), name = axis.rounded(each);

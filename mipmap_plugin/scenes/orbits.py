@@ -14,7 +14,7 @@ from mipmap_plugin.camera import Camera, viewmat_of
 from mipmap_plugin.effects import NEAR_PLANE
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.scenes.photographed import GOLDEN, SEEN_OPACITY, photographed, seen_ways
+from mipmap_plugin.scenes.photographed import GOLDEN, SEEN_OPACITY, photographed, quantile, seen_ways, sizes
 
 ORBIT_FOV = math.radians(50)  # along the shorter side: a normal lens
 
@@ -88,7 +88,7 @@ class Orbit:
         nearest = 0.0
         if not whole:
             from_here = sharp() / SHARP_PX * SHARP_FOCAL
-            outside = max(_quantile((means - center).norm(dim=1), MIDDLE).item(), 2 * NEAR_PLANE)
+            outside = max(quantile((means - center).norm(dim=1), MIDDLE).item(), 2 * NEAR_PLANE)
             distance, nearest = (min(distance, max(far, outside)) for far in (from_here, NEARER * from_here))
         x, y, z = center.tolist()
         vertical = guess_up(means) if up is None else (up[0], up[1], up[2])
@@ -101,7 +101,7 @@ class Orbit:
         """
         center = torch.tensor(self.center, dtype=torch.float64)
         away = (_finite(splats.means) - center).norm(dim=1)
-        outside, framing = max(_quantile(away, MIDDLE).item(), 2 * NEAR_PLANE), _quantile(away, FRAMED).item() / math.sin(ORBIT_FOV / 2)
+        outside, framing = max(quantile(away, MIDDLE).item(), 2 * NEAR_PLANE), quantile(away, FRAMED).item() / math.sin(ORBIT_FOV / 2)
         found = photographed(splats, center, outside, max(outside, framing), ORBIT_FOV / 2)
         if found is None or (not self.nearest and found.nearest > WITHIN * framing):
             return self
@@ -164,8 +164,8 @@ def frame(means: Tensor) -> tuple[Tensor, float, bool]:
     An object by itself is shown whole, and of a capture the nine tenths of the splats around the median. Raises SettingsError without splats.
     """
     means = _finite(means)
-    median, middle = means.median(dim=0).values, (_quantile(means, WHOLE) + _quantile(means, 1 - WHOLE)) / 2
-    most, whole = (_quantile((means - center).norm(dim=1), share).item() for center, share in ((median, FRAMED), (middle, WHOLE)))
+    median, middle = means.median(dim=0).values, (quantile(means, WHOLE) + quantile(means, 1 - WHOLE)) / 2
+    most, whole = (quantile((means - center).norm(dim=1), share).item() for center, share in ((median, FRAMED), (middle, WHOLE)))
     return (middle, whole, True) if whole <= TIGHT * most else (median, most, False)
 
 
@@ -178,13 +178,8 @@ def sharp_size(gaussians: Gaussians) -> float:
     if gaussians.covariances is not None or not seen.any():
         return math.inf
     away = (gaussians.means[seen] - gaussians.means[seen].median(dim=0).values).norm(dim=1)
-    inner = away <= _quantile(away, INNER)
+    inner = away <= quantile(away, INNER)
     return float(sizes(gaussians.detach())[seen][inner].median())
-
-
-def sizes(gaussians: Gaussians) -> Tensor:
-    """The size of each splat, [N] in world units: the geometric mean of its two longer axes (standard deviations)."""
-    return gaussians.scales.topk(2, dim=1).values.prod(dim=1).sqrt()
 
 
 def guess_up(means: Tensor) -> tuple[float, float, float] | None:
@@ -192,7 +187,7 @@ def guess_up(means: Tensor) -> tuple[float, float, float] | None:
 
     None for any other: of single objects neither the shape nor the light tells what is up, and files have y down, y up and z up.
     """
-    x, y, z = (_quantile(means, FRAMED) - _quantile(means, 1 - FRAMED)).tolist()
+    x, y, z = (quantile(means, FRAMED) - quantile(means, 1 - FRAMED)).tolist()
     return Y_DOWN if y < FLATTER * min(x, z) else None
 
 
@@ -256,8 +251,3 @@ def _finite(means: Tensor) -> Tensor:
     if len(means) == 0:
         raise SettingsError("an orbit needs splats, but got 0 finite splats")
     return means
-
-
-def _quantile(values: Tensor, share: float) -> Tensor:
-    """The value below which `share` of the first dimension lies. torch.quantile refuses more than 16 million values."""
-    return values.kthvalue(max(1, round(share * len(values))), dim=0).values

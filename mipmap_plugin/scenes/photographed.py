@@ -80,10 +80,10 @@ def photographed(splats: Gaussians, center: Tensor, nearest: float, farthest: fl
     return Photographed(near, FARTHER * near, _hexadecimal(seen), focal) if focal else None
 
 
-def even_directions() -> Tensor:
-    """`DIRECTIONS` unit vectors, [D, 3], evenly spread over the sphere (Fibonacci's)."""
-    number = torch.arange(DIRECTIONS, dtype=torch.float64)
-    height = 1 - (2 * number + 1) / DIRECTIONS
+def even_directions(count: int = DIRECTIONS) -> Tensor:
+    """`count` unit vectors, [D, 3] on the processor, evenly spread over the sphere (Fibonacci's)."""
+    number = torch.arange(count, dtype=torch.float64, device="cpu")
+    height = 1 - (2 * number + 1) / count
     turn, level = 2 * math.pi * GOLDEN * number, (1 - height**2).sqrt()
     return torch.stack([level * turn.cos(), level * turn.sin(), height], dim=1)
 
@@ -110,6 +110,16 @@ def agreement(splats: Gaussians, eyes: Tensor) -> Tensor:
     return (toward / everywhere + FLOOR).log() @ splats.opacities / splats.opacities.sum()
 
 
+def sizes(gaussians: Gaussians) -> Tensor:
+    """The size of each splat, [N] in world units: the geometric mean of its two longer axes (standard deviations)."""
+    return gaussians.scales.topk(2, dim=1).values.prod(dim=1).sqrt()
+
+
+def quantile(values: Tensor, share: float) -> Tensor:
+    """The value below which `share` of the first dimension lies. torch.quantile refuses more than 16 million values."""
+    return values.kthvalue(max(1, round(share * len(values))), dim=0).values
+
+
 def _telling(splats: Gaussians) -> Gaussians | None:
     """An even sample of the splats that can be seen and whose colors depend on the view, in double precision; None where there are too few."""
     if splats.covariances is not None or splats.sh.shape[1] < 2:
@@ -133,8 +143,8 @@ def _focal(splats: Gaussians, center: Tensor, eyes: Tensor, half_fov: float) -> 
     shown = closest.isfinite()
     if not shown.any():
         return 0.0
-    sizes = splats.scales.topk(2, dim=1).values.prod(dim=1).sqrt()[shown] / closest[shown]
-    smallest = sizes.kthvalue(max(1, round(SMALLEST * len(sizes)))).values.item()
+    pixels = sizes(splats)[shown] / closest[shown]
+    smallest = quantile(pixels, SMALLEST).item()
     return min(LONGEST, 1 / smallest) if smallest > 0 else LONGEST
 
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.morton import morton_codes
 from mipmap_plugin.render_settings import EvenBuckets, RenderSettings
 from mipmap_plugin.splatting.rotations import rotations
 
@@ -33,9 +34,8 @@ WEIGHTS = ((0, 40), (2, 20), (5, 8), (10, 3), (BINS, 1))
 # There are 2^b + 1 buckets, b = round(log2(N / 4)) clamped to these bounds.
 LEAST_BITS, MOST_BITS = 10, 20
 
-# Bits of the Morton code per axis, and how they are spread to every third place: (shift, bits kept), twice as far apart each time.
+# Bits of the Morton code per axis.
 MORTON_BITS = 10
-SPREADING = ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249))
 
 
 @torch.no_grad()
@@ -140,11 +140,7 @@ def depth_scale(box: Tensor, count: int, camera: Camera) -> DepthScale:
 
 
 def _morton(means: Tensor) -> Tensor:
-    """Morton code of each center, [N] int64: interleaved bits of x, y and z in a grid of 2^MORTON_BITS cells per axis of their bounding box."""
+    """Morton code of each center, [N] int64, in a grid of 2^MORTON_BITS cells per axis of their bounding box."""
     low, high = means.amin(0), means.amax(0)
     cells = ((means - low) * 2**MORTON_BITS / (high - low).clamp_min(torch.finfo(means.dtype).tiny)).clamp_max(2**MORTON_BITS - 1).long()
-    for shift, kept in SPREADING:
-        cells = (cells | cells << shift) & kept
-    x, y, z = cells.unbind(1)
-    code: Tensor = x | y << 1 | z << 2
-    return code
+    return morton_codes(cells)

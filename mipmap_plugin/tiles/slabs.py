@@ -16,7 +16,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.start.blend_weights import SHOWN
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import Effects
+from mipmap_plugin.effects import Effects, colorless
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.harmonics import C0
 from mipmap_plugin.tiles.splats import Splats
@@ -89,8 +89,7 @@ class Painter:
 
     def _weigh(self, splats: Splats, camera: Camera, weights: Tensor) -> None:
         """Add the blend weight of each splat in a view to `weights` [N]."""
-        settings = self.effects.settings.without_color_rounding()
-        effects = replace(self.effects, background=BLACK, sh_degree=0, settings=settings)
+        effects = colorless(self.effects)
         parts = slabs(*splats.seen_by(camera, effects.near_plane), COLORLESS_SLAB)
         through = torch.ones(*camera.size, 1)
         for slab in parts:

@@ -18,7 +18,7 @@ from mipmap_plugin.adaptation.start.candidates import start_name
 from mipmap_plugin.adaptation.start.closed_form import FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import matched_opacities
 from mipmap_plugin.adaptation.start.merging import merge_down, merge_seen
-from mipmap_plugin.adaptation.start.strength import Bounds, Candidate, Costs, Merger
+from mipmap_plugin.adaptation.start.strength import Bounds, Candidate, Merger, MergingCosts
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.formats.torch_file import save_torch
@@ -104,7 +104,7 @@ class StartSearch:
             splats = self._open(name)
             return Candidate(name, quality(scene, splats, self.truths), len(splats))
 
-        count, costs = sum(map(len, scene.cores)), Costs.of(config, scene.base_effects, scene.target)
+        count, costs = sum(map(len, scene.cores)), MergingCosts.of(config, scene.base_effects, scene.target)
         return Merger(merge, lambda power: math.ceil(config.merge_to**power * count), costs)
 
     def _file(self, name: str, number: int) -> Path:

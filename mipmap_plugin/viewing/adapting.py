@@ -68,11 +68,11 @@ class Progress:
 
 
 class Adapter:
-    """One run at a time. The base never changes."""
+    """One run at a time. The base never changes; `as_it_is` shows it."""
 
     def __init__(self, base: Wrapped, reference: Supersampled, changed: Callable[[], None] = lambda: None) -> None:
         """`changed` is called, in the thread of the run, whenever `progress` is new."""
-        self._base, self._reference, self._shown, self._changed = base, reference, File("base", base), changed
+        self._base, self._reference, self.as_it_is, self._changed = base, reference, File("base", base), changed
         self.progress = Progress()
         self._thread: threading.Thread | None = None
         self._warm = set[str | None]()  # the viewers that were adapted for before
@@ -144,7 +144,7 @@ class Adapter:
         judged = middle(wish.screen, MEASURED_PIXELS)
         request = Request(judged, wish.zoom, wish.viewer)
         truth, measured = self._reference.render(request).clamp(0, 1), -math.inf
-        self._set(base_db=psnr_as_shown(self._shown.render(request), truth))
+        self._set(base_db=psnr_as_shown(self.as_it_is.render(request), truth))
 
         @torch.no_grad()
         def observe(step: int, seconds: float, render: Callable[[Camera], Tensor]) -> bool:
@@ -185,13 +185,13 @@ class Live:
 
     name = "adapting"
 
-    def __init__(self, adapter: Adapter, base: File) -> None:
-        self._adapter, self._base = adapter, base
+    def __init__(self, adapter: Adapter) -> None:
+        self._adapter = adapter
 
     def render(self, request: Request) -> Tensor:
         """The picture, [H, W, 3], as the viewer draws it that the run is for."""
         image = self._adapter.picture(request.camera) if self._adapter.progress.running else None
-        return self._base.render(request) if image is None else image
+        return self._adapter.as_it_is.render(request) if image is None else image
 
     def shown(self, zoom: float) -> str:
         """The step."""

@@ -21,7 +21,7 @@ from mipmap_plugin.viewing.controls import AS_TRAINED, DISTANCE, NOWHERE, Contro
 from mipmap_plugin.viewing.pace import STILL_S, Pace
 from mipmap_plugin.viewing.screen import Pose, by_distance, by_lens, pose_of, up_of, zoomed
 from mipmap_plugin.viewing.server import served, without_words
-from mipmap_plugin.viewing.sources import File, of_adapted
+from mipmap_plugin.viewing.sources import of_adapted
 from mipmap_plugin.viewing.stage import Look, Stage, free_name, smaller
 
 OUT_OF_MEMORY = "out of memory; enlarge pixels, or make the window smaller"
@@ -67,8 +67,7 @@ class _Seen:
 class Page:
     """The page of one scene. Raises SettingsError without viser, or for an address that cannot be served."""
 
-    def __init__(self, stage: Stage, base: File, settings: PageSettings) -> None:
-        """`base`: the base, which is shown while a run has no state yet."""
+    def __init__(self, stage: Stage, settings: PageSettings) -> None:
         self._stage, self._settings, self._pace = stage, settings, Pace()
         self._changed, self._version = threading.Event(), 0
         self._sliding, self._slid = threading.Lock(), 0.0  # one movement of the slider after the other; when the last one was
@@ -76,7 +75,7 @@ class Page:
         self._slider_of: Any = None  # the browser in which it was moved, until its camera is where the slider says
         self._seen: dict[int, _Seen] = {}
         self.adapter = Adapter(stage.base, stage.reference, self._progressed)
-        self._live = stage.add(Live(self.adapter, base))
+        self._live = stage.add(Live(self.adapter))
         self._views = by_name(stage.base.views())
         self._server = served(settings.host, settings.port)
         self._prepare()

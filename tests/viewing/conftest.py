@@ -36,7 +36,7 @@ def page(stage, base, monkeypatch, tmp_path):
     server = MagicMock(**{f"gui.add_{kind}.side_effect": element for kind in ("dropdown", "slider", "number")})
     monkeypatch.setattr(live_page, "served", lambda *_: server)
     base.cameras = [replace(view, name="r_0") for view in base.cameras]
-    return Page(stage, File("base", base), PageSettings("127.0.0.1", 8080, "scene", [None], ["default"], lambda *_: tmp_path / "new.ply"))
+    return Page(stage, PageSettings("127.0.0.1", 8080, "scene", [None], ["default"], lambda *_: tmp_path / "new.ply"))
 
 
 @pytest.fixture(scope="module")

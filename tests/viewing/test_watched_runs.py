@@ -56,7 +56,7 @@ def test_a_run_shows_its_states_and_stopped_it_returns_the_best_and_the_base_sta
     before, request = digest(base), wish(base)
     seen, over = threading.Event(), threading.Event()  # the run goes on until a state was seen, however slow this machine is
     adapter = Adapter(base, Supersampled("supersampled", base), lambda: seen.is_set() and len(adapter.progress.curve) > 3 and adapter.stop())
-    live, start = Live(adapter, File("base", base)), File("base", base).render(Request(request.screen, request.zoom))
+    live, start = Live(adapter), File("base", base).render(Request(request.screen, request.zoom))
     adapter.start(request, over.set)
     while not over.is_set():
         if not torch.equal(live.render(Request(request.screen, request.zoom)), start):

@@ -14,7 +14,7 @@ from mipmap_plugin.adaptation.pixel_size import pictured
 from mipmap_plugin.adaptation.start.closed_form import filter_variance
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import Effects
+from mipmap_plugin.effects import Effects, colorless
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.process.threads import side_by_side
 from mipmap_plugin.splatting.harmonics import C0
@@ -56,7 +56,7 @@ def _of_views(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, e
     with any backend that has gradients, and faster with one that computes them itself, for a view (`Backend.blend_weights`) or for several
     (`Backend.weigh_views`).
     """
-    plain = replace(effects, sh_degree=0, settings=effects.settings.without_color_rounding())
+    plain = colorless(effects)
     weigh = getattr(backend, "blend_weights", None)
     gray = replace(gaussians, sh=torch.zeros_like(gaussians.sh[:, :1]))
 

@@ -18,9 +18,9 @@ from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.clock import Clock, start_clock
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import ROUNDS, matched_opacities
-from mipmap_plugin.adaptation.start.merging import Rounds, merge_down, merge_seen
+from mipmap_plugin.adaptation.start.merging import MergingRounds, merge_down, merge_seen
 from mipmap_plugin.adaptation.start.problem import StartProblem
-from mipmap_plugin.adaptation.start.strength import POWERS, Bounds, Candidate, Costs, Merger
+from mipmap_plugin.adaptation.start.strength import POWERS, Bounds, Candidate, Merger, MergingCosts
 from mipmap_plugin.adaptation.start.thinning import evenly_in_space, least_fraction
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.effects import SURFEL
@@ -81,7 +81,7 @@ class StartSearch:
     """The candidates, and the choice among them by their PSNR on the steering views."""
 
     def __init__(self, problem: StartProblem, clock: Clock) -> None:
-        self._problem, self._clock, self._rounds = problem, clock, Rounds()
+        self._problem, self._clock, self._rounds = problem, clock, MergingRounds()
         self._least, self._crispness = 0.0, problem.config.crispness  # the fraction of the rows that stay, of a zoom-in how crisp it is
         self._matching = ROUNDS  # rounds in which opacities are matched
         self._seen = BaseWeights(problem, clock)
@@ -186,7 +186,7 @@ class StartSearch:
                 candidate = self._candidate(weights, fraction, coarsely)
                 return Candidate(candidate, problem.quality(candidate), len(candidate.parameters()["means"]))
 
-        costs = Costs.of(problem.config, problem.base_effects, problem.target)
+        costs = MergingCosts.of(problem.config, problem.base_effects, problem.target)
         return Merger(merge, lambda power: math.ceil(self._fraction(power) * count), costs)
 
     def _fraction(self, power: float) -> float:

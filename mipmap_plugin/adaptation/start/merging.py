@@ -19,6 +19,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.parallel import CHUNK, in_chunks
 from mipmap_plugin.backends.cpu import nearest_along
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.morton import morton_codes
 from mipmap_plugin.process import threads
 from mipmap_plugin.splatting.eigen import quats_and_scales
 from mipmap_plugin.splatting.harmonics import C0
@@ -55,14 +56,11 @@ COARSEST_MERGE = 16.0
 # Cells of the space-filling curve lie at -2^19..2^19 on each axis, and are shifted by 2^19..2^20, so that 21 bits suffice.
 CELL_RANGE = 2**19
 
-# (shift, mask): each step moves bits apart, until two zeros follow every bit.
-SPREADS = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249))
-
 # Opacities stay below 1, whose logit is infinite.
 MAX_OPACITY = 0.999
 
 
-class Rounds:
+class MergingRounds:
     """The pairs of each round, which are searched once for all fractions that the same splats are merged down to."""
 
     def __init__(self) -> None:
@@ -85,14 +83,14 @@ class Rounds:
         return pairs
 
 
-def merge(gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float, rounds: Rounds | None = None) -> tuple[Gaussians, Tensor]:
+def merge(gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float, rounds: MergingRounds | None = None) -> tuple[Gaussians, Tensor]:
     """Merge splats down to a `fraction` (0..1) of them; return them and their blend weights.
 
     Merging ends early when hardly any pairs are within `MAX_DISTANCE` and `MAX_COST`. `pixel` [N]: the size of a target pixel at each splat,
     in world units. `weights` [N]: the blend weight of each splat, in target pixels of a view. `rounds`: of an earlier call for the same splats.
     """
     splats, target_count = _Moments.of(gaussians, pixel, weights), max(1, math.floor(fraction * len(gaussians)))
-    rows, old_weights, rounds = torch.arange(len(gaussians), device=weights.device), splats.weights, rounds or Rounds()
+    rows, old_weights, rounds = torch.arange(len(gaussians), device=weights.device), splats.weights, rounds or MergingRounds()
     for number in count_from():
         surplus = len(splats.weights) - target_count
         if surplus <= 0 or (pairs := rounds.of(number, splats)) is None:
@@ -104,7 +102,7 @@ def merge(gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float,
 
 
 def merge_seen(
-    gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float, seen: Tensor, rounds: Rounds | None = None
+    gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float, seen: Tensor, rounds: MergingRounds | None = None
 ) -> tuple[Gaussians, Tensor]:
     """`merge` of the splats that are `seen` [N]; those that no view shows, which would not tell the harm, stay as they are, behind the others."""
     if seen.all():
@@ -261,7 +259,7 @@ def _surface(covariances: Tensor) -> Tensor:
 
 
 def along_curve(means: Tensor, pixel: Tensor, shift: Tensor) -> Tensor:
-    """The order [N] of `means` [N, 3] along a Z-order curve (Morton 1966), on which neighbors in space mostly follow each other.
+    """The order [N] of `means` [N, 3] along a Z-order curve (`morton`).
 
     Its cells measure a quarter of `pixel`. `shift` [3], 0..1, moves them, because neighbors that one curve separates are close on another.
     """
@@ -269,9 +267,6 @@ def along_curve(means: Tensor, pixel: Tensor, shift: Tensor) -> Tensor:
 
     def place(chunk: slice) -> Tensor:
         cells = (4 * (means[chunk] - center) / pixel).clamp(-CELL_RANGE, CELL_RANGE - 1)
-        bits = (cells + CELL_RANGE * (1 + shift.to(cells))).long()
-        for step, mask in SPREADS:
-            bits = (bits | bits << step) & mask
-        return bits[:, 0] | bits[:, 1] << 1 | bits[:, 2] << 2
+        return morton_codes((cells + CELL_RANGE * (1 + shift.to(cells))).long())
 
     return torch.cat(in_chunks(place, means)).argsort(stable=True)

@@ -53,7 +53,7 @@ class Bounds(NamedTuple):
         return self._replace(psnr=max(self.psnr, quality.psnr - costs))
 
 
-class Costs(NamedTuple):
+class MergingCosts(NamedTuple):
     """dB that merging may cost."""
 
     usual: float
@@ -61,7 +61,7 @@ class Costs(NamedTuple):
     learns: bool  # whether steps follow, which regain what merging costs
 
     @classmethod
-    def of(cls, config: AdaptConfig, base: Effects, target: Effects) -> Costs:
+    def of(cls, config: AdaptConfig, base: Effects, target: Effects) -> MergingCosts:
         """Those of a run. `base`, `target`: how the base and the adapted file are rendered."""
         usual, learns = config.merging_costs, config.steps > 0
         return cls(usual, max(usual, MILD_COSTS) if learns and base != target and usual else usual, learns)
@@ -74,7 +74,7 @@ class Merger(Generic[Made]):
     # to a power of `merge_to`, whether even where too few share a pixel; None: there is no time
     merge: Callable[[float, bool], Candidate[Made] | None]
     least: Callable[[float], int]  # how many splats a power leaves where as many are merged as it says
-    costs: Costs
+    costs: MergingCosts
 
     def strongest(self, bounds: Bounds, coarse_bounds: Bounds | None = None) -> Candidate[Made] | None:
         """The candidate of the strongest merging within the bounds; None if merging costs too much.

@@ -11,13 +11,8 @@ from numba import types
 from mipmap_plugin.backends.cpu_kernels import inner, kernel
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, maximum, minimum, sqrt
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, scratch, store
-from mipmap_plugin.backends.cpu_kernels.powers import exp2
+from mipmap_plugin.backends.cpu_kernels.powers import LARGEST_POWER, LOG2E, exp2
 from mipmap_plugin.splatting.rotations import LEAST_QUATERNION
-
-LOG2E = 1 / math.log(2)
-
-# Powers of two within which `exp2` is defined: larger and smaller scales and opacities are not drawn any differently.
-LARGEST_POWER = 125.0
 
 new_rest = scratch(WIDTH, types.float32)
 
@@ -143,4 +138,5 @@ def store_some(array, at, size, lanes, rest):
 
 @inner
 def exponential(lanes):
+    """e^lanes; scales and opacities beyond what `exp2` is defined for are not drawn any differently."""
     return exp2(minimum(maximum(lanes * LOG2E, 0 - LARGEST_POWER), LARGEST_POWER))

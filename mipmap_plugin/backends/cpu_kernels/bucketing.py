@@ -10,7 +10,8 @@ import torch
 
 from mipmap_plugin.backends.cpu_kernels import inner, kernel
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.splatting.buckets import BINS, BOX, MORTON_BITS, SPREADING, depth_scale
+from mipmap_plugin.morton import SPREADING
+from mipmap_plugin.splatting.buckets import BINS, BOX, MORTON_BITS, depth_scale
 
 # Bits by which keys are sorted at a time: their counts fit a first-level cache.
 DIGIT_BITS = 11

@@ -45,7 +45,7 @@ PASSES = (
 
 # The folders and files whose constants and functions are compiled into kernels.
 ROOT = Path(__file__).parents[2]
-SOURCES = ("backends/cpu_kernels/*.py", "splatting/*.py", "effects.py", "render_settings.py")
+SOURCES = ("backends/cpu_kernels/*.py", "splatting/*.py", "effects.py", "morton.py", "render_settings.py")
 
 
 def kernel(function):

@@ -60,10 +60,8 @@ def composite(start, stop, integrated, limits, table, lists, frame, outputs):
             find_patches(table, members, patches, first + begin, first + end, box, found)
             for n in range(begin, end):
                 splat = row_of(table, members[first + n])
-                if integrated is not None:
-                    draw_integral(splat, limits, patches[first + n] & unfinished, n, box, state)
-                elif splat[layout.GATE] > 0:
-                    draw_splat(splat, limits, patches[first + n] & unfinished, n, box, state)
+                if integrated is not None or splat[layout.GATE] > 0:
+                    draw_splat(splat, integrated, limits, patches[first + n] & unfinished, n, box, state)
         write_tile(box, state, frame, outputs)
 
 
@@ -97,33 +95,28 @@ def unfinished_patches(state):
 
 
 @inner
-def draw_splat(splat, limits, patches, n, box, state):
+def draw_splat(splat, integrated, limits, patches, n, box, state):
     """Blend a splat, the n-th of its tile, behind those already blended, into `patches`."""
     color = splat[layout.RED], splat[layout.GREEN], splat[layout.BLUE]
     while patches != 0:
         patch = lowest_bit(patches)
         patches &= patches - 1
-        power = log_alpha(splat, *distances(splat, patch, box))
-        alpha = fma(exp2(power), splat[layout.GAIN], 0 - splat[layout.OFFSET])
-        blend(alpha, power >= LOG_MIN_ALPHA, limits, color, n, patch * WIDTH, state)
+        alpha, bright = alpha_of(splat, integrated, *distances(splat, patch, box))
+        blend(alpha, bright, limits, color, n, patch * WIDTH, state)
 
 
 @inner
-def log_alpha(splat, dx, dy):
-    """log2 of alpha, before GAIN and OFFSET, at lanes of pixels dx, dy px from the center."""
+def alpha_of(splat, integrated, dx, dy):
+    """A splat's alpha at lanes of pixels dx, dy px from its center, and where that reaches 1/255 or where the splat ends.
+
+    One that is integrated may reach less in its outline, which is that of its bounding ellipse.
+    """
+    if integrated is not None:
+        alpha = integrals.alpha(splat, dx, dy)
+        return alpha, alpha >= MIN_ALPHA
     u = fma(dy, 0 - splat[layout.SHEAR], dx)
-    return fma(u * u, 0 - splat[layout.FALL_X], fma(dy * dy, 0 - splat[layout.FALL_Y], splat[layout.PEAK]))
-
-
-@inner
-def draw_integral(splat, limits, patches, n, box, state):
-    """As `draw_splat`, for a splat that is integrated over pixels; the outline is that of its bounding ellipse."""
-    color = splat[layout.RED], splat[layout.GREEN], splat[layout.BLUE]
-    while patches != 0:
-        patch = lowest_bit(patches)
-        patches &= patches - 1
-        alpha = integrals.alpha(splat, *distances(splat, patch, box))
-        blend(alpha, alpha >= MIN_ALPHA, limits, color, n, patch * WIDTH, state)
+    power = fma(u * u, 0 - splat[layout.FALL_X], fma(dy * dy, 0 - splat[layout.FALL_Y], splat[layout.PEAK]))
+    return fma(exp2(power), splat[layout.GAIN], 0 - splat[layout.OFFSET]), power >= LOG_MIN_ALPHA
 
 
 @inner

@@ -4,8 +4,7 @@
 # mypy: ignore-errors
 
 from mipmap_plugin.backends.cpu_kernels import inner, integrals, kernel, layout
-from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA
-from mipmap_plugin.backends.cpu_kernels.compositing import fill_range, log_alpha, tile_box
+from mipmap_plugin.backends.cpu_kernels.compositing import alpha_of, fill_range, tile_box
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, fma, lowest_bit
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, row_of, store
 from mipmap_plugin.backends.cpu_kernels.patches import BATCH, prefetch_rows
@@ -23,7 +22,6 @@ from mipmap_plugin.backends.cpu_kernels.planes import (
     offset_of,
     unblend,
 )
-from mipmap_plugin.backends.cpu_kernels.powers import exp2
 from mipmap_plugin.backends.cpu_kernels.sums import summed, summed_product, total, totals, zero_sum
 from mipmap_plugin.render_settings import MIN_ALPHA
 
@@ -112,9 +110,8 @@ def undraw_splat(splat, limits, fades, patches, n, box, state, grads):
         patch = lowest_bit(patches)
         patches &= patches - 1
         dx, dy = distances(splat, patch, box)
-        power = log_alpha(splat, dx, dy)
-        alpha, u = fma(exp2(power), splat[layout.GAIN], 0 - offset), fma(dy, 0 - splat[layout.SHEAR], dx)
-        s, d_alpha, weight, d_red, d_green, d_blue = unblend(alpha, power >= LOG_MIN_ALPHA, limits, color, n, patch * WIDTH, state)
+        (alpha, bright), u = alpha_of(splat, None, dx, dy), fma(dy, 0 - splat[layout.SHEAR], dx)
+        s, d_alpha, weight, d_red, d_green, d_blue = unblend(alpha, bright, limits, color, n, patch * WIDTH, state)
         sum_1 = summed(sum_1, s)
         if fades:
             s = fma(d_alpha, offset, s)  # the offset does not depend on the shape
@@ -140,9 +137,8 @@ def undraw_culled(splat, patches, n, box, state, grads):
     while patches != 0:
         patch = lowest_bit(patches)
         patches &= patches - 1
-        power = log_alpha(splat, *distances(splat, patch, box))
-        alpha = fma(exp2(power), splat[layout.GAIN], 0 - splat[layout.OFFSET])
-        sum_1 = summed(sum_1, grad_culled(alpha, power >= LOG_MIN_ALPHA, color, n, patch * WIDTH, state))
+        alpha, bright = alpha_of(splat, None, *distances(splat, patch, box))
+        sum_1 = summed(sum_1, grad_culled(alpha, bright, color, n, patch * WIDTH, state))
     for k in range(layout.GRADS):
         grads[k] = 0
     grads[layout.SUM] = total(sum_1)

@@ -6,14 +6,11 @@ All numbers are lanes of float64. Shapes are (xx, xy, yy, det) as in `ellipses`,
 # numba redefines calls and operators.
 # mypy: ignore-errors
 
-import math
 
 from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.lanes import both, maximum, minimum, narrow, select, sqrt, wide
 from mipmap_plugin.backends.cpu_kernels.powers import exp2, log2
 from mipmap_plugin.splatting.culls import ASIDE, STEEPNESS
-
-LOG2E = 1 / math.log(2)
 
 # The ratio for a limit that is not set: greater than any other.
 NO_LIMIT = 1e300

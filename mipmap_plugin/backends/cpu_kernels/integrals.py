@@ -11,11 +11,9 @@ import math
 from mipmap_plugin.backends.cpu_kernels import inner, layout
 from mipmap_plugin.backends.cpu_kernels.blocks import put
 from mipmap_plugin.backends.cpu_kernels.lanes import fma, maximum, minimum, narrow, select, sqrt
-from mipmap_plugin.backends.cpu_kernels.powers import exp2, log2, tanh
+from mipmap_plugin.backends.cpu_kernels.powers import LARGEST_POWER, LOG2E, exp2, log2, tanh
 from mipmap_plugin.render_settings import MIN_ALPHA
 from mipmap_plugin.splatting.pixel_integral import BOUND, CUBIC, LINEAR, MAX_POWER, ROUND
-
-LOG2E = 1 / math.log(2)
 
 # A Gaussian with this factor times the opacity is an upper bound of the integral.
 BOUND_SQUARED = BOUND * BOUND
@@ -156,7 +154,7 @@ def pixel_fraction(u, per_sigma):
 @inner
 def clamped_exp(x):
     """exp(x), with x clamped to float32's range."""
-    return exp2(minimum(maximum(x * LOG2E, -125.0), MAX_POWER * LOG2E))
+    return exp2(minimum(maximum(x * LOG2E, 0 - LARGEST_POWER), MAX_POWER * LOG2E))
 
 
 @inner

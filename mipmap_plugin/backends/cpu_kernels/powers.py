@@ -11,6 +11,15 @@ from numba.extending import intrinsic
 from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.lanes import fma, integers, lane_wise, maximum, narrow, select, wide
 
+# The logarithm of e to base 2, and half of it: exp(-q/2) = 2^(-HALF_LOG2E · q).
+LOG2E, HALF_LOG2E = 1 / math.log(2), 0.5 / math.log(2)
+
+# Powers of two, positive and negative, within which `exp2` is defined.
+LARGEST_POWER = 125.0
+
+# 1.5 · 2^23: adding it to a float32 leaves the nearest integer in the low bits, and subtracting it again rounds to that integer.
+ROUNDER = 12582912.0
+
 
 def _all(ints, number):
     """The same integer in every lane."""
@@ -29,15 +38,11 @@ def _add_to_exponent(_context, lanes, rounded):
     return lane_wise(emit)(lanes, rounded)
 
 
-# 1.5 · 2^23: adding it to a float32 leaves the nearest integer in the low bits.
-_ROUNDER = 12582912.0
-
-
 @inner
 def exp2(power):
     """2^power, relative error 1e-7, for -126 < power < 127; undefined outside."""
-    rounded = power + _ROUNDER
-    remainder = power - (rounded - _ROUNDER)  # -0.5 .. 0.5
+    rounded = power + ROUNDER
+    remainder = power - (rounded - ROUNDER)  # -0.5 .. 0.5
     series = fma(remainder, 0.00132647272, 0.00967151264)  # minimax in relative error, exactly 1 at 0
     series = fma(series, remainder, 0.0555073374)
     series = fma(series, remainder, 0.240222421)
@@ -95,5 +100,5 @@ def tanh(x):
     series = fma(series, xx, 2 / 15)
     series = fma(series, xx, -1 / 3)
     series = fma(series, xx, 1.0) * x
-    decay = wide(exp2(narrow(maximum(x * (-2 / math.log(2)), -125.0))))
+    decay = wide(exp2(narrow(maximum(x * (-2 / math.log(2)), 0 - LARGEST_POWER))))
     return select(x < 0.25, series, (1 - decay) / (1 + decay))

@@ -18,13 +18,10 @@ from mipmap_plugin.backends.cpu_kernels.columns import apart, load_four, load_th
 from mipmap_plugin.backends.cpu_kernels.lanes import PART, WIDTH, absolute, bits, both, lowest_bit, maximum, narrow, select, sqrt, wide
 from mipmap_plugin.backends.cpu_kernels.layout import HUGE
 from mipmap_plugin.backends.cpu_kernels.memory import beyond, load, pointer, scratch, store, store_integers
-from mipmap_plugin.backends.cpu_kernels.powers import log2
+from mipmap_plugin.backends.cpu_kernels.powers import HALF_LOG2E, log2
 from mipmap_plugin.backends.cpu_kernels.records import OVER_PIXEL
 from mipmap_plugin.backends.cpu_kernels.tuples import apply, dot, minus, plus, times
 from mipmap_plugin.render_settings import MIN_ALPHA
-
-# -q/2 = -HALF_LOG2E · q in powers of two.
-HALF_LOG2E = 0.5 / math.log(2)
 
 # Fields of a block of splats in the world, float64, as in `SplatArrays`. A shape is either a covariance or a quaternion and scales.
 MEAN, OPACITY, COVARIANCE, QUAT, SCALE = 0, 3, 4, 4, 8

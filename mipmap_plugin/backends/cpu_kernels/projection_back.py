@@ -153,20 +153,9 @@ def grad_shape(view, integrated, reshaped, shape, opacity, sums):
     dilated, compensation = ellipses.screen_filter(view, shape)
     if integrated is not None:
         return grad_integral(view, shape, dilated, opacity, sums)
-    if reshaped is not None:
-        return grad_reshaped(view, shape, dilated, compensation, opacity, sums)
-    d_dilated, d_x, d_y = grad_ellipse(dilated, sums)
-    d_log_alpha = get(sums, layout.SUM)
-    d_shape = ellipses.grad_screen_filter(view, shape, dilated, compensation, d_dilated, d_log_alpha / compensation)
-    return d_shape, d_log_alpha / opacity, d_x, d_y
-
-
-@inner
-def grad_reshaped(view, shape, dilated, compensation, opacity, sums):
-    """`grad_shape` where a view culls, stretches or shrinks splats."""
-    if view.culls:
+    if reshaped is not None and view.culls:
         return grad_culled(view, shape, dilated, compensation, opacity, sums)
-    d_dilated, d_x, d_y = grad_limited(view, dilated, sums)
+    d_dilated, d_x, d_y = grad_ellipse(dilated, sums) if reshaped is None else grad_limited(view, dilated, sums)
     d_log_alpha = get(sums, layout.SUM)
     d_shape = ellipses.grad_screen_filter(view, shape, dilated, compensation, d_dilated, d_log_alpha / compensation)
     return d_shape, d_log_alpha / opacity, d_x, d_y

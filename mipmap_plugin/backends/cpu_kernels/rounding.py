@@ -4,16 +4,12 @@
 # mypy: ignore-errors
 
 from mipmap_plugin.backends.cpu_kernels import inner, kernel, layout
-from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA
-from mipmap_plugin.backends.cpu_kernels.compositing import fill_range, log_alpha, tile_box
+from mipmap_plugin.backends.cpu_kernels.compositing import alpha_of, fill_range, tile_box
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, fma, lowest_bit, maximum, minimum, select
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, row_of, store
 from mipmap_plugin.backends.cpu_kernels.patches import BATCH, find_patches, new_found
 from mipmap_plugin.backends.cpu_kernels.planes import PATCH, PLANE, distances, new_state, offset_of
-from mipmap_plugin.backends.cpu_kernels.powers import exp2
-
-# 1.5 · 2^23: adding it to a float32 and subtracting it again rounds to the nearest integer.
-ROUNDER = 12582912.0
+from mipmap_plugin.backends.cpu_kernels.powers import ROUNDER
 
 
 @kernel
@@ -49,9 +45,8 @@ def draw_splat(splat, limits, patches, box, state):
     while patches != 0:
         patch = lowest_bit(patches)
         patches &= patches - 1
-        power, at = log_alpha(splat, *distances(splat, patch, box)), patch * WIDTH
-        alpha = fma(exp2(power), splat[layout.GAIN], 0 - splat[layout.OFFSET])
-        alpha = select(power >= LOG_MIN_ALPHA, minimum(alpha, max_alpha), 0)
+        (alpha, bright), at = alpha_of(splat, None, *distances(splat, patch, box)), patch * WIDTH
+        alpha = select(bright, minimum(alpha, max_alpha), 0)
         blend_channel(alpha, splat[layout.RED], step, at, state)
         blend_channel(alpha, splat[layout.GREEN], step, PLANE + at, state)
         blend_channel(alpha, splat[layout.BLUE], step, 2 * PLANE + at, state)

@@ -5,21 +5,18 @@
 
 import numpy as np
 
-from mipmap_plugin.backends.cpu_kernels import inner, integrals, kernel, layout, sorting
-from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA
-from mipmap_plugin.backends.cpu_kernels.compositing import init_tile, log_alpha, tile_box, unfinished_patches
+from mipmap_plugin.backends.cpu_kernels import inner, kernel, layout, sorting
+from mipmap_plugin.backends.cpu_kernels.compositing import alpha_of, init_tile, tile_box, unfinished_patches
 from mipmap_plugin.backends.cpu_kernels.drawing import Shot, project, team_for
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, broadcast, fma, lowest_bit, minimum, select
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, broadcast, lowest_bit, minimum, select
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, row_of, store
 from mipmap_plugin.backends.cpu_kernels.patches import BATCH, find_patches, new_found
 from mipmap_plugin.backends.cpu_kernels.planes import TRANSMITTANCE, distances, new_state
-from mipmap_plugin.backends.cpu_kernels.powers import exp2
 from mipmap_plugin.backends.cpu_kernels.records import Limits, SplatArrays
 from mipmap_plugin.backends.cpu_kernels.sums import total
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.process.pool import empty
-from mipmap_plugin.render_settings import MIN_ALPHA
 
 
 def weigh(splats: SplatArrays, camera: Camera, effects: Effects, ranks: np.ndarray | None = None) -> np.ndarray:
@@ -55,10 +52,8 @@ def weigh_tiles(start, stop, integrated, limits, table, lists, size, by_pair):
             find_patches(table, members, patches, first + begin, first + end, box, found)
             for n in range(begin, end):
                 splat = row_of(table, members[first + n])
-                if integrated is not None:
-                    by_pair[slots[first + n]] = weigh_integral(splat, limits, patches[first + n] & unfinished, box, state)
-                elif splat[layout.GATE] > 0:
-                    by_pair[slots[first + n]] = weigh_splat(splat, limits, patches[first + n] & unfinished, box, state)
+                if integrated is not None or splat[layout.GATE] > 0:
+                    by_pair[slots[first + n]] = weigh_splat(splat, integrated, limits, patches[first + n] & unfinished, box, state)
 
 
 @kernel
@@ -72,27 +67,14 @@ def sum_pairs(start, stop, firsts, by_pair, by_splat):
 
 
 @inner
-def weigh_splat(splat, limits, patches, box, state):
+def weigh_splat(splat, integrated, limits, patches, box, state):
     """Blend a splat into `patches`; returns the sum of its weights (as `compositing.draw_splat`)."""
     weights = broadcast(0)
     while patches != 0:
         patch = lowest_bit(patches)
         patches &= patches - 1
-        power = log_alpha(splat, *distances(splat, patch, box))
-        alpha = fma(exp2(power), splat[layout.GAIN], 0 - splat[layout.OFFSET])
-        weights = weights + blended(alpha, power >= LOG_MIN_ALPHA, limits, patch * WIDTH, state)
-    return total(weights)
-
-
-@inner
-def weigh_integral(splat, limits, patches, box, state):
-    """As `weigh_splat`, for a splat that is integrated over pixels."""
-    weights = broadcast(0)
-    while patches != 0:
-        patch = lowest_bit(patches)
-        patches &= patches - 1
-        alpha = integrals.alpha(splat, *distances(splat, patch, box))
-        weights = weights + blended(alpha, alpha >= MIN_ALPHA, limits, patch * WIDTH, state)
+        alpha, bright = alpha_of(splat, integrated, *distances(splat, patch, box))
+        weights = weights + blended(alpha, bright, limits, patch * WIDTH, state)
     return total(weights)
 
 

@@ -7,11 +7,10 @@ import math
 
 from mipmap_plugin.backends.cpu_kernels import inner, layout
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, fma, maximum, minimum, select, sqrt
-from mipmap_plugin.backends.cpu_kernels.powers import exp2
+from mipmap_plugin.backends.cpu_kernels.powers import HALF_LOG2E, LARGEST_POWER, exp2
 from mipmap_plugin.render_settings import MAX_ALPHA
 from mipmap_plugin.splatting.window import FARTHEST, LEAST_VARIANCE, POINTS, WEIGHTS, WIDE
 
-HALF_LOG2E = 0.5 / math.log(2)
 ALL = (1 << WIDTH) - 1
 
 # px: a bound on the distance from a pixel's center to a corner of its window, rotated by any angle about the window's own center.
@@ -146,7 +145,7 @@ def differences(u, width, per_sigma):
 
 @inner
 def gaussian(x):
-    return exp2(maximum(x * x * (0 - HALF_LOG2E), -125.0))
+    return exp2(maximum(x * x * (0 - HALF_LOG2E), 0 - LARGEST_POWER))
 
 
 @inner

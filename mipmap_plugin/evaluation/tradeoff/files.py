@@ -17,7 +17,7 @@ import torch
 from mipmap_plugin.adaptation.plot import figure_class
 from mipmap_plugin.adaptation.report import versions
 from mipmap_plugin.evaluation.report import markdown
-from mipmap_plugin.evaluation.tradeoff.front import Tradeoff, files, frames, front, milliseconds, seconds
+from mipmap_plugin.evaluation.tradeoff.front import Tradeoff, frames
 from mipmap_plugin.evaluation.tradeoff.plot import OTHERWISE, draw
 from mipmap_plugin.evaluation.tradeoff.points import Point, Spread
 from mipmap_plugin.formats.atomic import new_file, refuse_output, refuse_unwritable, settled, together, write_json
@@ -36,7 +36,7 @@ def facts(tradeoffs: Sequence[Tradeoff], complete: bool) -> dict[str, Any]:
 
 
 def _facts_of(each: Tradeoff) -> dict[str, Any]:
-    fronts = (front(files(each.points), seconds), front(frames(each.points), milliseconds))
+    fronts = each.fronts()
     sentences = dict(zip(("seconds", "frames"), each.sentences(), strict=True))
     marks = [{"on_front_of_seconds": point in fronts[0], "on_front_of_frames": point in fronts[1]} for point in each.points]
     points = [asdict(point) | mark for point, mark in zip(each.points, marks, strict=True)]
@@ -120,7 +120,7 @@ def _flat(point: Point) -> dict[str, Any]:
 
 def table(each: Tradeoff) -> str:
     """A table of all final points, best first, with the truth, both sentences and the notes."""
-    best = front(files(each.points), seconds), front(frames(each.points), milliseconds)
+    best = each.fronts()
     body = [
         [point.name, point.backend, _text(point.psnr_db, 2), _text(point.adapt_seconds, 2), _text(point.ms_per_frame, 1), f"{point.gaussians:,}",
          " ".join(mark for mark, points in zip(("s", "ms"), best, strict=True) if point in points), point.ended_by]

@@ -24,6 +24,10 @@ class Tradeoff:
         """The result in sentences: for seconds of adapting, and for milliseconds per frame."""
         return seconds_sentence(self.points), frames_sentence(self.points)
 
+    def fronts(self) -> tuple[list[Point], list[Point]]:
+        """The Pareto fronts: for seconds of adapting, and for milliseconds per frame."""
+        return front(files(self.points), seconds), front(frames(self.points), milliseconds)
+
 
 def seconds(point: Point) -> float:
     return point.adapt_seconds.median

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.adaptation.plot import figure_class
-from mipmap_plugin.evaluation.tradeoff.front import Cost, Tradeoff, files, frames, front, knee, milliseconds, seconds
+from mipmap_plugin.evaluation.tradeoff.front import Cost, Tradeoff, files, frames, knee, milliseconds, seconds
 from mipmap_plugin.evaluation.tradeoff.points import Point, Spread
 from mipmap_plugin.formats.atomic import new_file
 
@@ -55,7 +55,7 @@ def _seconds(axes: Any, each: Tradeoff, colors: dict[str, Any]) -> None:
     axes.set_xlabel("seconds to adapt (dotted: nothing to adapt, but only in a renderer that has it)")
     axes.set_ylabel(each.truth, fontsize=8)
     _title(axes, each, 0)
-    _front(axes, files(each.points), seconds)
+    _front(axes, each.fronts()[0], seconds)
 
 
 def _frames(axes: Any, each: Tradeoff, colors: dict[str, Any]) -> None:
@@ -65,7 +65,7 @@ def _frames(axes: Any, each: Tradeoff, colors: dict[str, Any]) -> None:
     axes.set_xscale("log")
     axes.set_xlabel("milliseconds a frame")
     _title(axes, each, 1)
-    _front(axes, frames(each.points), milliseconds)
+    _front(axes, each.fronts()[1], milliseconds)
 
 
 def _title(axes: Any, each: Tradeoff, nth: int) -> None:
@@ -77,8 +77,7 @@ def _mark(axes: Any, point: Point, cost: Spread, color: Any, label: str | None) 
     axes.errorbar(cost.median, point.psnr_db.median, up, across, fmt=MARKS[point.kind], color=color, markersize=6, capsize=2, label=label)
 
 
-def _front(axes: Any, points: Sequence[Point], cost: Cost) -> None:
-    best = front(points, cost)
+def _front(axes: Any, best: Sequence[Point], cost: Cost) -> None:
     axes.step([cost(p) for p in best], [p.psnr_db.median for p in best], where="post", color="black", linewidth=1.2, zorder=0)
     if (found := knee(best, cost)) is not None:
         axes.plot(found.cost, found.point.psnr_db.median, marker="*", markersize=17, color="none", markeredgecolor="black")

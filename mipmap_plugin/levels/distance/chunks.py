@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mipmap_plugin.formats.streamed_sog import SMALLEST_CHUNK
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.splatting.rotations import rotations
+from mipmap_plugin.splatting.projection import axes_of
 
 # Splats of a chunk, of all levels together, that splat-transform does not cut any further, whatever its size.
 LEAST = 1024 * SMALLEST_CHUNK
@@ -36,7 +36,7 @@ class Chunks:
 
         A box holds its splats up to one standard deviation, as splat-transform's do, less what PlayCanvas shrinks it by.
         """
-        reach = (rotations(gaussians.quats) * gaussians.scales[:, None, :]).abs().sum(2)
+        reach = axes_of(gaussians.quats, gaussians.scales).abs().sum(2)
         means, cuts, leaves = gaussians.means, list[tuple[int, float, int, int]](), list[Tensor]()
 
         def cut(rows: Tensor) -> int:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import torch
@@ -30,7 +30,7 @@ from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Calls
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.effects import explain
+from mipmap_plugin.effects import colorless, explain
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance.coarsening import coarsened, kept_splats
 from mipmap_plugin.levels.distance.mixture import Mixture
@@ -107,9 +107,9 @@ class LevelRun:
         """[H, W, 3], 0..1: the part of each pixel that is this level's. Without it, the level would make up for what others lack elsewhere."""
 
         def make() -> Tensor:
-            live, target = self.scene.pixel_of(self.finest.means) < self.size, self.scene.target
-            plain = replace(target, sh_degree=0, background=(0.0, 0.0, 0.0), settings=target.settings.without_color_rounding())
-            return self.scene.backend.render(self.unmerged.part_of(self.number, live, camera), camera, plain).image.clamp(0, 1)
+            live = self.scene.pixel_of(self.finest.means) < self.size
+            part = self.unmerged.part_of(self.number, live, camera)
+            return self.scene.backend.render(part, camera, colorless(self.scene.target)).image.clamp(0, 1)
 
         return self.shares((camera.viewmat.numpy().tobytes(), camera.size, camera.fx, camera.cx, camera.cy), make)
 

@@ -24,8 +24,7 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.screen_filters import COMPENSATED
 from mipmap_plugin.splatting.filters import SQUARE_VARIANCE
-from mipmap_plugin.splatting.projection import project
-from mipmap_plugin.splatting.rotations import rotations
+from mipmap_plugin.splatting.projection import covariances_of, project
 
 # The part of a view's splats that lies before what counts as its foreground.
 FOREGROUND = 0.1
@@ -74,12 +73,11 @@ class WalkTruth:
         scales = self._scales(view, begin)
         whole = effects.eps2d * square * scales.square()
         spread = whole - (square - 1) * SQUARE_VARIANCE * scales.square()
-        axes = rotations(splats.quats) * splats.scales[:, None, :]
         depth = fine.to_camera(splats.means)[:, 2].clamp_min(effects.near_plane)
         across = fine.viewmat[:2, :3].to(splats.means)  # the camera's right and down, along which the screen's x and y run
         focals = splats.means.new_tensor([fine.fx, fine.fy])
         variances = spread.clamp_min(0)[:, None] * (depth[:, None] / focals).square()  # [N, 2] world units²
-        covariances = axes @ axes.mT + torch.einsum("nk,ki,kj->nij", variances, across, across)
+        covariances = covariances_of(splats) + torch.einsum("nk,ki,kj->nij", variances, across, across)
         opacities = splats.opacities
         if effects.screen_filter in COMPENSATED:
             projected = project(splats, fine, effects.near_plane, effects.settings)

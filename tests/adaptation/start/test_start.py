@@ -25,14 +25,14 @@ pytestmark = pytest.mark.usefixtures("few_views")
 
 def test_what_a_start_was_searched_with_is_gone_during_the_steps(monkeypatch):
     """The pairs of all rounds of merging, for one."""
-    found = list[weakref.ref[candidates.Rounds]]()
+    found = list[weakref.ref[candidates.MergingRounds]]()
 
-    class Kept(candidates.Rounds):
+    class Kept(candidates.MergingRounds):
         def __init__(self):
             super().__init__()
             found.append(weakref.ref(self))
 
-    monkeypatch.setattr(candidates, "Rounds", Kept)
+    monkeypatch.setattr(candidates, "MergingRounds", Kept)
     left = list[bool]()
     adapted(steps=2, merge_to=0.5, observe=lambda *_: left.append(any(rounds() for rounds in found)))
     assert found and left and not any(left)

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from mipmap_plugin.adaptation.optimization.validation import Quality
-from mipmap_plugin.adaptation.start.strength import Bounds, Candidate, Costs, Merger
+from mipmap_plugin.adaptation.start.strength import Bounds, Candidate, Merger, MergingCosts
 
 SPLATS, FORMED = 64, 30.0
 BOUNDS = Bounds(FORMED - 0.3, 0.0, FORMED)
@@ -22,7 +22,7 @@ def chosen(limited, coarse, *, learns=False, reached=0):
         left, psnrs = (left, coarse) if coarsely else (max(left, reached), limited)
         return Candidate(left, Quality(*[psnrs.get(left, -math.inf)] * 2), left)
 
-    found = Merger(merge, lambda power: math.ceil(SPLATS * 16**-power), Costs(0.3, 0.3, learns)).strongest(BOUNDS)
+    found = Merger(merge, lambda power: math.ceil(SPLATS * 16**-power), MergingCosts(0.3, 0.3, learns)).strongest(BOUNDS)
     return None if found is None else found.made
 
 
