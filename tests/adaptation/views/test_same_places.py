@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import pytest
 import tiny
@@ -177,6 +178,13 @@ def test_without_cameras_it_is_told_where_views_look_from(files, recwarn):
 def test_what_is_up_is_not_asked_for_where_colors_tell_from_where_to_look():
     lying = Orbit((0.0, 0.0, 0.0), None, 2.0, nearest=1.0)
     assert "--up" in orbited(None, lying) and "--up" not in orbited(None, replace(lying, seen="f", focal=500.0))
+
+
+def test_of_an_spz_it_is_told_that_what_is_up_may_be_guessed_wrongly():
+    """Phones write it with y up, others with the axes of a PLY."""
+    guessed = Orbit((0.0, 0.0, 0.0), (0.0, -1.0, 0.0), 2.0, nearest=1.0)
+    assert "--up y" in orbited(Path("a.spz"), guessed) and "--up" not in orbited(Path("a.ply"), guessed)
+    assert "--up" not in orbited(Path("a.spz"), replace(guessed, said=True))
 
 
 def test_what_somebody_says_is_up_is_told_with_where_a_capture_was_photographed():
