@@ -55,8 +55,8 @@ ORBITED = (
 CAPTURE = "; this seems to be a capture, and from where it was photographed is a guess: seen from there it may look worse than its base"
 VIEWED = ", or adapt for what you look at (mipmap-plugin view)"
 
-# The format is meant to have y up, but its own converter, too, keeps the axes of a PLY, mostly with y down (nianticlabs/spz, issue 84), and no file says
-# which it has. splat-transform and Spark take what is stored.
+# Its own converter, too, keeps the axes of a PLY, mostly with y down (nianticlabs/spz, issue 84), and no file says which axes it has. splat-transform
+# and Spark take what is stored.
 OF_SPZ = "; an .spz is meant to have y up: if this one has, say so (--up y)"
 
 # Lenses whose focal lengths (px) have a larger ratio need different files, as scales of that ratio do. A ratio of 5 costs a capture 10 of 12 dB.
