@@ -43,7 +43,7 @@ FAR_FEWER, REACHED = 1 / 4, 1.5
 # Where more than this part of the splats become too faint to be drawn, opacities are also matched in one round, or in none, where they are told by
 # this power of areas: what is not drawn has no weight, and is raised until all together hide several times too much. Four objects gain 0 to 4 dB
 # by it at x1/16, 1 to 8 at x1/32 and 5 to 11 at x1/64, two captures nothing.
-FAINT, FEWER = 0.1, ((1, AREA_POWER), (0, AREA_POWER), (0, 1.0))
+FAINT, FEWER = 0.1, ((1, AREA_POWER), (0, 1.0), (0, AREA_POWER))
 
 # The budget is long enough for a search if that is expected to end within this part of the start's time; whole runs need less of it.
 SEARCH_PART = 1 / 4
@@ -146,7 +146,8 @@ class StartSearch:
     def _matched_less(self, formed: SplatModel, quality: Quality, weights: Tensor) -> tuple[SplatModel, Quality]:
         """The closed form, or with opacities matched in fewer rounds where many become too faint to be drawn, if it looks better; and its quality."""
         drawn, still_drawn = (self._drawn(model) for model in (self._problem.base(), formed))
-        for rounds, power in FEWER if (drawn & ~still_drawn).float().mean() > FAINT else ():
+        fewer = FEWER[:-1] if self._alike else FEWER  # the last is no closed form of a filter that draws alike
+        for rounds, power in fewer if (drawn & ~still_drawn).float().mean() > FAINT else ():
             if self._clock.allows("candidate"):
                 self._matcher.rounds, self._power = rounds, power
                 less = self._candidate(weights, 1.0)

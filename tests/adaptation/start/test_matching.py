@@ -8,6 +8,7 @@ import torch
 
 from mipmap_plugin.adaptation.start import matcher
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
+from mipmap_plugin.adaptation.start.candidates import StartSearch
 from mipmap_plugin.adaptation.start.clock import Clock
 from mipmap_plugin.adaptation.start.matcher import UNMATCHED
 from mipmap_plugin.adaptation.start.matching import MAX_FACTOR, ROUNDS, matched_opacities
@@ -109,6 +110,15 @@ def test_without_steps_opacities_that_come_out_too_faint_are_matched_in_fewer_ro
     monkeypatch.setattr(matcher, "matched_opacities", matched)
     found = base.adapt(1 / 4, recipe="instant", merge_to=1.0).model.gaussians(tiny.cameras()[0]).opacities
     assert rounds == asked and found.mean() > 1e-2
+
+
+@pytest.mark.parametrize(("screen_filter", "count"), [("classic", 4), ("antialiased", 3)])
+def test_a_filter_that_draws_alike_has_no_closed_form_without_matching(monkeypatch, screen_filter, count):
+    tried, candidate = [], StartSearch._candidate
+    monkeypatch.setattr(StartSearch, "_candidate", lambda *given: tried.append(1) or candidate(*given))
+    monkeypatch.setattr(matcher, "matched_opacities", lambda opacities, *_: opacities * 1e-4)
+    wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference", screen_filter=screen_filter).adapt(1 / 4, recipe="instant", merge_to=1.0)
+    assert len(tried) == count
 
 
 def test_before_steps_opacities_are_matched_once(monkeypatch):
