@@ -17,6 +17,7 @@ from mipmap_plugin.adaptation.parallel import in_batches
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.errors import SettingsError, some_of
+from mipmap_plugin.formats.splat_transform import is_spz
 from mipmap_plugin.limits import check_image
 from mipmap_plugin.models.base import SplatModel, places
 from mipmap_plugin.models.contract import row_opacities
@@ -54,6 +55,10 @@ ORBITED = (
 )
 CAPTURE = "; this seems to be a capture, and from where it was photographed is a guess: seen from there it may look worse than its base"
 VIEWED = ", or adapt for what you look at (mipmap-plugin view)"
+
+# Its own converter, too, keeps the axes of a PLY, mostly with y down (nianticlabs/spz, issue 84), and no file says which axes it has. splat-transform
+# and Spark take what is stored.
+OF_SPZ = "; an .spz is meant to have y up: if this one has, say so (--up y)"
 
 # Lenses whose focal lengths (px) have a larger ratio need different files, as scales of that ratio do. A ratio of 5 costs a capture 10 of 12 dB.
 UNLIKE = 3.0
@@ -232,7 +237,11 @@ def orbited(source: Path | None, orbit: Orbit) -> str:
     """What is said of views of an orbit: `ORBITED`, with the cameras.json that lies beside the file of the splats."""
     file, whole = unread_cameras(source), not orbit.nearest
     beside = f", such as {file}, if it is of this scene" if file else ""
-    others = ("" if whole else VIEWED) + ("" if orbit.up or orbit.seen else ", or say what is up (--up z, for one)")
+    others = "" if whole else VIEWED
+    if not (orbit.up or orbit.seen):
+        others += ", or say what is up (--up z, for one)"
+    elif not (orbit.said or orbit.seen) and source is not None and is_spz(source):
+        others += OF_SPZ
     return f"{ORBITED.format(told=orbit.told(), seems='' if whole else CAPTURE)}{beside}{others}"
 
 

@@ -20,7 +20,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.adapted_scale import adapted_orbit
 from mipmap_plugin.models.base import SplatModel, places
 from mipmap_plugin.process.threads import side_by_side
-from mipmap_plugin.scenes.orbits import Orbit, sharp_size
+from mipmap_plugin.scenes.orbits import EVERY, Orbit, sharp_size
 from mipmap_plugin.scenes.photographed import sizes
 from mipmap_plugin.splatting.harmonics import C0
 
@@ -40,6 +40,10 @@ MOMENTS = (0.0, 0.5, 1.0)
 # If a time budget allows to look at fewer views than this, any are taken.
 LEAST_LOOKS = 16
 
+# Which of five pairs of views is finer. Of validation views the first of a pair steers and the second chooses: so as many of both are finer, one of
+# eight views each, two of sixteen, and none of four.
+FINER_PAIR = 2
+
 INSTEAD = "give the scene's cameras (--cameras), or adapt for what you look at (mipmap-plugin view)"
 UNCLEAR = f"no generated view that was looked at sees this capture clearly, only through fog or walls, or nothing: any are taken; {INSTEAD}"
 HURRIED = f"the time budget leaves no time to look for views that see this capture clearly: any are taken; give more, or {INSTEAD}"
@@ -52,11 +56,20 @@ class Viewpoints:
     orbit: Orbit
     clear: Callable[[Sequence[Camera]], list[Camera]]  # those of the views that see it clearly (`ClearViews`)
     looks: float = math.inf  # so many views may be looked at (`amount.looks_in_budget`)
-    finer: bool = True  # whether some views are finer (`Orbit.views`): those that are adapted to, but not those that stand for the training's
+    finer: bool = True  # whether a fifth of the views are finer (`Orbit.finer`): not of those that stand for the training's
 
     def views(self, size: tuple[int, int], count: int, generator: torch.Generator) -> list[Camera]:
         """`count` views of `size` (height, width) px. Of a capture they are clear: fewer where fewer are, and any, with a warning, where none is."""
-        first = self.orbit.views(size, count, generator, finer=self.finer)
+        views = self._in_one_detail(size, count, generator)
+        numbers = [number for number in range(len(views)) if number % (2 * EVERY) // 2 == FINER_PAIR] if self.finer and self.orbit.focal else []
+        finer = [self.orbit.finer(views[number], size, generator) for number in numbers]
+        clear = self.clear(finer) if self.looks == math.inf else finer  # a time budget is spent on looking at the others
+        taken = {number: view for number, view in zip(numbers, finer, strict=True) if view in clear}
+        return [taken.get(number, view) for number, view in enumerate(views)]
+
+    def _in_one_detail(self, size: tuple[int, int], count: int, generator: torch.Generator) -> list[Camera]:
+        """The `views`, none of which is finer."""
+        first = self.orbit.views(size, count, generator)
         if not self.orbit.nearest:
             return first
         if self.looks < min(count, LEAST_LOOKS):
@@ -68,7 +81,7 @@ class Viewpoints:
             missing = count - len(found)
             most = int(min(math.ceil(missing * tried / max(1, len(found))), count, self.looks - tried))
             if most > 0:
-                looked_at = evenly(self.orbit.views(size, count, generator, number * count, finer=self.finer), most)
+                looked_at = evenly(self.orbit.views(size, count, generator, number * count), most)
                 found, tried = found + evenly(self.clear(looked_at), missing), tried + most
         if not found:
             warn(UNCLEAR)

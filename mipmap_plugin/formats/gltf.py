@@ -26,7 +26,8 @@ SPLATTING = "KHR_gaussian_splatting"
 SPZ_INSIDE = ("KHR_gaussian_splatting_compression_spz_2", "KHR_gaussian_splatting_compression_spz")
 SPZ_ITSELF = "KHR_spz_gaussian_splats_compression"
 
-# Display colors, as the extension calls them, and as its drafts did.
+# Display colors, as the extension calls them, and as its drafts did. Splats are blended in their own colors, and only pictures are encoded for a
+# display: half of white over black is 0.5 in linear light, which a display shows as 0.74, whatever is made of the colors of the two.
 DISPLAY = ("srgb_rec709_display", "bt.709-srgb", "bt.709")
 
 # Attributes that splats are made of, after a prefix; files have others, for viewers that draw points.
@@ -135,8 +136,9 @@ class _Document:
         if (kernel := said.get("kernel", "ellipse")) != "ellipse":
             raise CheckpointError(f"{self._path}: its splats have the kernel {kernel!r}, and only 'ellipse' is read; export it as a PLY of 3DGS")
         if (space := said.get("colorSpace", DISPLAY[0])).lower() not in DISPLAY:
-            remedy = f"export it with {DISPLAY[0]!r}, or as a PLY"
-            raise CheckpointError(f"{self._path}: its colors are in {space!r}, which is not read here; {remedy}")
+            why = "in which its splats are blended too, so that no others look the same"
+            remedy = f"if it was trained on photographs as they are, export it with {DISPLAY[0]!r}, or as a PLY"
+            raise CheckpointError(f"{self._path}: its colors are in {space!r}, {why}; {remedy}")
         known = (*SPZ_INSIDE, SPZ_ITSELF)
         if unknown := [name for name in said.get("extensions", {}) if name not in known and name in self._json.get("extensionsRequired", [])]:
             raise CheckpointError(f"{self._path}: its splats are kept by {unknown[0]}, which is not read here; export it as a PLY")

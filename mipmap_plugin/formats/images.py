@@ -36,8 +36,8 @@ BYTES_PER_PIXEL = 4 + 12
 # Pixels that are composited at a time, in 64 bits each.
 TOGETHER = 2**18
 
-# What Pillow raises for a file that is not an image, a damaged one, a damaged PNG chunk and an absurd size.
-UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
+# What Pillow raises for a file that is not an image, a damaged one and a damaged PNG chunk.
+UNREADABLE = (OSError, SyntaxError, ValueError)
 
 # What NumPy raises for a file that is not an array, or whose header, a line of Python, is damaged.
 NO_ARRAY = (OSError, ValueError, TypeError, SyntaxError, TokenError, OverflowError, RecursionError)
@@ -242,6 +242,8 @@ def _opened(path: str | Path) -> Image.Image:
         raise
     except FileNotFoundError as error:
         raise SceneError(f"{path}: there is no such image; check the path") from error
+    except Image.DecompressionBombError as error:  # from the header alone: Pillow reads no image of more than twice MAX_IMAGE_PIXELS
+        raise SceneError(f"{path}: has over {2 * (Image.MAX_IMAGE_PIXELS or 0):,} px, more than a camera takes; give it smaller") from error
     except UNREADABLE as error:
         advice = "give a PNG or JPEG file (or, if it is a Git LFS pointer, run `git lfs pull` where it came from)"
         raise SceneError(f"{path}: is not an image that Pillow reads; {advice}") from error

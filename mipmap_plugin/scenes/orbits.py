@@ -116,26 +116,33 @@ class Orbit:
         name = next((name for name, axis in AXES.items() if axis == self.up), f"({', '.join(f'{part:.3g}' for part in self.up)})")
         return f"{where}, with {name} up"
 
-    def views(self, size: tuple[int, int], count: int, generator: torch.Generator, first: int = 0, *, finer: bool = True) -> list[Camera]:
+    def views(self, size: tuple[int, int], count: int, generator: torch.Generator, first: int = 0) -> list[Camera]:
         """`count` views of `size` (height, width) px: from above the horizon, or from all around where no vertical is known (the highest first).
 
-        `first`: the number of the first of them, in their names; `finer`: whether in every fifth of a capture pixels are half as large.
+        `first`: the number of the first of them, in their names.
         """
         if count < 1:
             raise SettingsError(f"an orbit needs views, but got {count}")
-        center, vertical = (torch.tensor(vector, dtype=torch.float64) for vector in (self.center, self.up or Y_DOWN))
-        vertical = vertical / vertical.norm()
+        center, vertical = self._axes()
         directions = self._ways(vertical, count, generator)
         # Two far, two near: if all views of one part of the turn were near, these would be on one side only, and if every other view were, all of
         # them would be in the same half of the validation views.
         far = [self.distance if i // 2 % 2 == 0 else self.nearest or self.distance for i in range(count)]
-        fine = [FINER if finer and (first + i) % EVERY == EVERY - 1 else 1.0 for i in range(count)]
-        # But for that all show the middle in the same detail.
-        focals = [detail * self.focal * each / (self.nearest or each) for detail, each in zip(fine, far, strict=True)]
+        focals = [self.focal * each / (self.nearest or each) for each in far]  # so that all show the middle in the same detail
         views = [
             _looking_at(center, center + far[i] * way, vertical, size, f"orbit_{first + i:04d}", focals[i]) for i, way in enumerate(directions)
         ]
         return [_part(view, generator) for view in views]
+
+    def finer(self, view: Camera, size: tuple[int, int], generator: torch.Generator) -> Camera:
+        """One of the `views` of a `size` (height, width) px, whose pixels are half as large."""
+        center, vertical = self._axes()
+        return _part(_looking_at(center, view.center.double(), vertical, size, view.name, FINER * view.fx), generator)
+
+    def _axes(self) -> tuple[Tensor, Tensor]:
+        """The center and the unit vector that pictures have upwards, [3] each."""
+        center, vertical = (torch.tensor(vector, dtype=torch.float64) for vector in (self.center, self.up or Y_DOWN))
+        return center, vertical / vertical.norm()
 
     def _ways(self, vertical: Tensor, count: int, generator: torch.Generator) -> Tensor:
         """The directions of `count` cameras, unit vectors [count, 3], with `vertical` (unit) upwards."""

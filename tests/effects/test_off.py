@@ -223,10 +223,11 @@ def test_an_upsampler_that_is_called_for_is_imported(broken_upsampler):
         wrapped(with_bands(1, 1)).adapt(4, upsampler=broken_upsampler, compare_at="target", **BRIEF)
 
 
-def test_steps_by_autograd_load_no_compiler(monkeypatch):
+@pytest.mark.parametrize(("scale", "settings"), [(1 / 2, {}), (2, dict(upsampler="bicubic", compare_at="both"))])
+def test_steps_by_autograd_load_no_compiler(monkeypatch, scale, settings):
     """As gradients that are given to torch do, which takes the time of many steps."""
     monkeypatch.setitem(sys.modules, "torch.fx.experimental.symbolic_shapes", None)
-    assert wrapped(with_bands(1, 1)).adapt(1 / 2, **BRIEF).report.curve[-1].step == 2
+    assert wrapped(with_bands(1, 1)).adapt(scale, **BRIEF, **settings).report.curve[-1].step == 2
 
 
 # Prints, a line each, which modules were imported: by adapting, by rendering an image, and by rendering its depth too.

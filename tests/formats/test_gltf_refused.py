@@ -19,7 +19,7 @@ def test_meshes_without_splats(tmp_path):
     ("path", "to", "told"),
     [
         ((*gltf_files.SAID, "kernel"), "cube", "have the kernel 'cube'"),
-        ((*gltf_files.SAID, "colorSpace"), "lin_rec709_display", "its colors are in 'lin_rec709_display'"),
+        ((*gltf_files.SAID, "colorSpace"), "lin_rec709_display", "its colors are in 'lin_rec709_display', in which its splats are blended too"),
         (("nodes", 0, "scale"), [1, 2, 1], "stretches them unevenly"),
         (("nodes", 0, "scale"), [-1, 1, 1], "mirrors its splats"),
         (("nodes", 0, "scale"), [0, 0, 0], "stretches them unevenly"),

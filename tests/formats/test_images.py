@@ -116,9 +116,10 @@ def cut_off(path):
         (lambda path: path.write_text("version https://git-lfs.github.com/spec/v1\n"), "is not an image that Pillow reads"),
         (program, "is not an image that Pillow reads"),
         (cut_off, "the image is damaged"),
+        (lambda path: write_png(path, (20_000, 10_000), RGB, b""), "has over 178,956,970 px, more than a camera takes; give it smaller"),
         (lambda path: Image.fromarray(np.float32([[0.2, 0.9]])).save(path, "TIFF"), "its pixels are floats, .*; save it with 8 or 16 bits"),
     ],
-    ids=["absent", "a text", "a program", "cut off", "floats, which would be black"],
+    ids=["absent", "a text", "a program", "cut off", "too large for Pillow", "floats, which would be black"],
 )
 def test_what_is_no_image_is_refused(tmp_path, make, said):
     make(tmp_path / "a.png")

@@ -10,7 +10,7 @@ from lone_capture import COUNT, FAR, cameras, capture, draws, table
 
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.adapted_scale import orbit_in
-from mipmap_plugin.scenes.orbits import EVERY, FINER, ORBIT_FOV, Orbit
+from mipmap_plugin.scenes.orbits import FINER, ORBIT_FOV, Orbit
 from mipmap_plugin.scenes.photographed import CONTRAST, FARTHER, LEAST, LONGEST, SMALLEST, agreement, even_directions, photographed, seen_ways
 
 CENTER = torch.zeros(3, dtype=torch.float64)
@@ -96,16 +96,22 @@ def test_splats_that_are_not_finite_are_not_asked():
     assert found(broken).nearest == pytest.approx(found(splats).nearest, rel=0.3)
 
 
-def test_views_are_where_the_colors_tell_half_of_them_farther_and_all_but_a_fifth_in_the_same_detail():
+def test_views_are_where_the_colors_tell_half_of_them_farther_and_all_in_the_same_detail():
     orbit = Orbit.around(table(), sharp=lambda: 0.01).where_photographed(capture())
     views = orbit.views((10_000, 10_000), 40, draws(6))
     center = torch.tensor(orbit.center, dtype=torch.float64)
     far = torch.stack([view.center.double() - center for view in views]).norm(dim=1)
     assert sorted({round(each, 6) for each in far.tolist()}) == [round(orbit.nearest, 6), round(FARTHER * orbit.nearest, 6)]
-    details = [view.fx / float(each) * orbit.nearest / orbit.focal for view, each in zip(views, far, strict=True)]
-    assert details == pytest.approx([FINER if number % EVERY == EVERY - 1 else 1 for number in range(40)])
-    assert {round(each, 6) for each in far[EVERY - 1 :: EVERY].tolist()} == {round(each, 6) for each in far.tolist()}
+    assert [view.fx / float(each) for view, each in zip(views, far, strict=True)] == pytest.approx([orbit.focal / orbit.nearest] * len(views))
     assert [view.width for view in views] == pytest.approx([2 * view.fx * math.tan(ORBIT_FOV / 2) for view in views], abs=1)
+
+
+def test_a_finer_view_is_the_same_with_pixels_half_as_large():
+    orbit = Orbit.around(table(), sharp=lambda: 0.01).where_photographed(capture())
+    [view] = orbit.views((10_000, 10_000), 1, draws(6))
+    finer = orbit.finer(view, (10_000, 10_000), draws(7))
+    assert torch.allclose(finer.viewmat, view.viewmat, atol=1e-6) and finer.name == view.name
+    assert (finer.fx, finer.width, finer.cx) == pytest.approx((FINER * view.fx, FINER * view.width, FINER * view.cx), abs=1)
 
 
 def test_pictures_are_no_larger_than_asked_and_keep_their_detail():

@@ -50,8 +50,8 @@ def _compare_one(view: Camera, image: Tensor, target: Tensor, config: AdaptConfi
         return gradient_before(gradient, (image.shape[0], image.shape[1]), config.resize), square_error
     difference = difference_from(target, image.requires_grad_(), config.resize)
     gradient, square_error = gradient_of(difference.detach(), config.loss)
-    further = detail(view, image)
-    [whole] = torch.autograd.grad((difference, further), image, (gradient, torch.ones_like(further)))
+    # The sum has this gradient in the difference; torch.autograd.grad takes gradients by themselves too, but it loads sympy.
+    [whole] = torch.autograd.grad((difference * gradient).sum() + detail(view, image), image)
     return whole, square_error
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import cast
 
@@ -14,20 +14,17 @@ from mipmap_plugin.adaptation.optimization.amount import takes_steps
 from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.pixel_size import mean_pixel_size
 from mipmap_plugin.adaptation.start.base_weights import BaseWeights
-from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.clock import Clock, start_clock
-from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices
-from mipmap_plugin.adaptation.start.matching import ROUNDS, matched_opacities
+from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike
+from mipmap_plugin.adaptation.start.matcher import Matcher
+from mipmap_plugin.adaptation.start.matching import ROUNDS
 from mipmap_plugin.adaptation.start.merging import MergingRounds, merge_down, merge_seen
 from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.adaptation.start.strength import POWERS, Bounds, Candidate, Merger, MergingCosts
 from mipmap_plugin.adaptation.start.thinning import evenly_in_space, least_fraction
-from mipmap_plugin.camera import evenly
-from mipmap_plugin.effects import SURFEL
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SPLATS, SplatModel, Thinned, places
 from mipmap_plugin.models.contract import rebuild, reshape
-from mipmap_plugin.screen_filters import INTEGRATED
 
 # Crispnesses also tried where a zoom-in below CRISPER_BELOW takes no steps: from there on the softest always looks best, shrunk, even of thin wires.
 CRISPER, CRISPER_BELOW = (0.5, 1.0), 2.0
@@ -43,6 +40,11 @@ COARSE_COSTS = 3.0
 # 5 dB by it; two captures and three other scenes keep 2.1 times as many and more, and the captures' starts would lose 0.7 to 2 dB.
 FAR_FEWER, REACHED = 1 / 4, 1.5
 
+# Where more than this part of the splats become too faint to be drawn, opacities are also matched in one round, or in none, where they are told by
+# this power of areas: what is not drawn has no weight, and is raised until all together hide several times too much. Four objects gain 0 to 4 dB
+# by it at x1/16, 1 to 8 at x1/32 and 5 to 11 at x1/64, two captures nothing.
+FAINT, FEWER = 0.1, ((1, AREA_POWER), (0, 1.0), (0, AREA_POWER))
+
 # The budget is long enough for a search if that is expected to end within this part of the start's time; whole runs need less of it.
 SEARCH_PART = 1 / 4
 
@@ -53,10 +55,6 @@ def start_name(forms: bool, *, merged: bool = False, thinned: bool = False) -> s
     if not forms:
         return splats
     return f"the closed form of {splats}" if merged else "the closed form"
-
-
-# What is said where a time budget ended before opacities were matched to the base's blend weights (`matching`), which gains some dB.
-UNMATCHED = "the time budget left no time to fit opacities to what splats show in the base's images, so that the start has less dB than it could"
 
 
 @torch.no_grad()
@@ -83,15 +81,13 @@ class StartSearch:
     def __init__(self, problem: StartProblem, clock: Clock) -> None:
         self._problem, self._clock, self._rounds = problem, clock, MergingRounds()
         self._least, self._crispness = 0.0, problem.config.crispness  # the fraction of the rows that stay, of a zoom-in how crisp it is
-        self._matching = ROUNDS  # rounds in which opacities are matched
+        self._power = AREA_POWER  # of the areas, where opacities are not matched
         self._seen = BaseWeights(problem, clock)
+        self._matcher = Matcher(problem, clock, self._seen)
         self.notes = self._seen.notes
         self._alike = draws_alike(problem.base_effects, problem.target)
         self._forms = problem.config.closed_form
         self._learns = takes_steps(problem.config, problem.scale, problem.base_effects, [problem.target])  # whether steps follow
-        spreads = problem.target.screen_filter == SURFEL or problem.target.screen_filter in INTEGRATED  # otherwise than by a variance in px²
-        suffices = filter_suffices(problem.base_effects, problem.target)
-        self._matches_weights = problem.has_blend_weights and not suffices and (problem.scale <= 1 or not spreads)
 
     @torch.no_grad()
     def best(self) -> tuple[SplatModel, str]:
@@ -102,9 +98,9 @@ class StartSearch:
             return base, problem.name
         with problem.phase("blend weights"):
             merges = config.merge_to < 1 and not base.traits.thins
-            weights = self._seen.measured(base) if self._matches_weights or merges or too_many else None
+            weights = self._seen.measured(base) if self._matcher.is_of_use or merges or too_many else None
         if too_many:
-            return self._candidate(weights, 0.0), start_name(self._forms, merged=True)
+            return self._with_most(weights), start_name(self._forms, merged=True)
         if (merged := self._merged_at_once(weights)) is not None:
             return merged, start_name(self._forms, merged=True)
         with self._clock.timing("candidate"):
@@ -137,17 +133,58 @@ class StartSearch:
         return formed, quality
 
     def _matched_as_shown(self, formed: SplatModel, quality: Quality, weights: Tensor | None) -> tuple[SplatModel, Quality]:
-        """The closed form, or with opacities matched in as many rounds again if no step follows and it looks better by that; and its quality."""
-        problem, matches = self._problem, self._forms and self._matches_weights and not self._learns
-        if weights is None or not matches or not self._clock.allows("weights", ROUNDS):
+        """The closed form, or with opacities matched in fewer or more rounds if no step follows and it looks better by that; and its quality."""
+        if self._learns or not self._forms or not self._matcher.is_of_use or weights is None:
             return formed, quality
-        further, splats = problem.base(), formed.gaussians(problem.views[0]).detach()
+        less, better = self._matched_less(formed, quality, weights)
+        further, best = self._matched_further(formed, quality, weights, self._seen.whole_of_base, self._problem.base)
+        if better.visible > best.visible:
+            return less, better
+        self._matcher.rounds = ROUNDS if further is formed else 2 * ROUNDS  # of merged splats too
+        return further, best
+
+    def _matched_less(self, formed: SplatModel, quality: Quality, weights: Tensor) -> tuple[SplatModel, Quality]:
+        """The closed form, or with opacities matched in fewer rounds where many become too faint to be drawn, if it looks better; and its quality."""
+        drawn, still_drawn = (self._drawn(model) for model in (self._problem.base(), formed))
+        fewer = FEWER[:-1] if self._alike else FEWER  # the last is no closed form of a filter that draws alike
+        for rounds, power in fewer if (drawn & ~still_drawn).float().mean() > FAINT else ():
+            if self._clock.allows("candidate"):
+                self._matcher.rounds, self._power = rounds, power
+                less = self._candidate(weights, 1.0)
+                if (better := self._problem.quality(less)).visible > quality.visible:
+                    formed, quality = less, better
+        self._matcher.rounds, self._power = ROUNDS, AREA_POWER
+        return formed, quality
+
+    def _drawn(self, model: SplatModel) -> Tensor:
+        """[N] bool: which splats are opaque enough for the target to draw them."""
+        return model.gaussians(self._problem.views[0]).opacities >= self._problem.target.settings.min_alpha
+
+    def _matched_further(
+        self, formed: SplatModel, quality: Quality, weights: Tensor, whole: Tensor, copied: Callable[[], SplatModel]
+    ) -> tuple[SplatModel, Quality]:
+        """The closed form, or with opacities matched in as many rounds again if it looks better by that; and its quality.
+
+        `whole`: as of `Matcher.matched`; `copied`: makes a model of the same splats, whose scales and opacities may be others.
+        """
+        problem = self._problem
+        if not self._clock.allows("weights", ROUNDS):
+            return formed, quality
+        further, splats = copied(), formed.gaussians(problem.views[0]).detach()
         with problem.phase("closed form"):
-            reshape(further, lambda _: (splats.scales, self._matched(splats, weights, self._seen.whole_of_base, ROUNDS)), problem.views)
-        if (better := problem.quality(further)).visible <= quality.visible:
-            return formed, quality
-        self._matching = 2 * ROUNDS  # of merged splats too
-        return further, better
+            reshape(further, lambda _: (splats.scales, self._matcher.matched(splats, weights, whole, ROUNDS)), problem.views)
+        better = problem.quality(further)
+        return (further, better) if better.visible > quality.visible else (formed, quality)
+
+    def _with_most(self, weights: Tensor | None) -> SplatModel:
+        """The closed form of `most_splats` merged splats."""
+        student, weights = self._reduced(weights, 0.0)
+        merged = student.gaussians(self._problem.views[0]).detach()
+        self._form(student, weights)
+        if self._learns or not self._forms or not self._matcher.is_of_use or weights is None:
+            return student
+        whole = self._seen.whole(merged, self._seen.pixel_size(merged.means))
+        return self._matched_further(student, self._problem.quality(student), weights, whole, student.copy)[0]
 
     def _merged_at_once(self, weights: Tensor | None) -> SplatModel | None:
         """The strongest merging, where a time budget is too short for a search and this is no worse than the base; else None."""
@@ -201,7 +238,13 @@ class StartSearch:
         return bounds._replace(psnr=max(bounds.psnr, LEAST_DB, finer.psnr - self._problem.may_lose, base.psnr - COARSE_COSTS))
 
     def _candidate(self, weights: Tensor | None, fraction: float, coarsely: bool = False) -> SplatModel:
-        """The base in closed form, after merging its splats down to a fraction of them, or to the settings' `most_splats`."""
+        """The base in closed form, after merging its splats (`_reduced`)."""
+        student, weights = self._reduced(weights, fraction, coarsely)
+        self._form(student, weights)
+        return student
+
+    def _reduced(self, weights: Tensor | None, fraction: float, coarsely: bool = False) -> tuple[SplatModel, Tensor | None]:
+        """The base after merging its splats down to a fraction of them, or to the settings' `most_splats`; and the blend weights of these."""
         problem, student = self._problem, self._problem.base()
         if fraction < 1 and weights is not None:
             with problem.phase("merging"):
@@ -210,8 +253,7 @@ class StartSearch:
             with problem.phase("thinning"):
                 means = student.parameters()["means"].detach()
                 cast(Thinned, student).thin(evenly_in_space(means, self._seen.pixel_size(means) / problem.scale, fraction))
-        self._form(student, weights)
-        return student
+        return student, weights
 
     def _form(self, student: SplatModel, weights: Tensor | None) -> None:
         """Give the student's splats, which have these blend weights, the closed form."""
@@ -242,34 +284,13 @@ class StartSearch:
 
     def _closed_form(self, gaussians: Gaussians, weights: Tensor | None) -> tuple[Tensor, Tensor]:
         """Scales [N, 3] and opacities [N] in closed form, with opacities that match the blend weights where these are known."""
-        problem, rounds = self._problem, self._matching_rounds(weights)
+        problem, rounds = self._problem, self._matcher.rounds_for(weights)
         pixel = self._seen.pixel_size(gaussians.means)
         formed_for = mean_pixel_size(gaussians.means, problem.closest_of, self._seen.count) if problem.scale > 1 else pixel
-        settings = FormSettings(1.0 if rounds else AREA_POWER, self._crispness, self._seen.count, formed_for, matched=rounds > 0)
+        power = 1.0 if rounds else self._power
+        settings = FormSettings(power, self._crispness, self._seen.count, formed_for, matched=power == 1)
         scales, opacities = closed_form(gaussians, problem.views, problem.scale, problem.base_effects, problem.target, settings)
         if weights is None or not rounds:
             return scales, opacities
         formed = replace(gaussians, scales=scales, opacities=opacities)
-        return scales, self._matched(formed, weights, self._seen.whole(gaussians, pixel), rounds)
-
-    def _matched(self, splats: Gaussians, weights: Tensor, whole: Tensor, rounds: int) -> Tensor:
-        """The opacities [N] of splats in closed form, for these blend weights [N]; `whole` [N]: those of the base if nothing hid it."""
-        problem = self._problem
-        size = min(self._seen.size, problem.scale)  # a zoom-in is weighed in images of the base's size: sums over pixels need no finer ones
-        finer = problem.scale / size
-        target = replace(problem.target, eps2d=problem.target.eps2d / finer**2, settings=problem.target.settings.finer(1 / finer))
-        views = [view.zoomed(size) for view in evenly(problem.views, self._seen.count)]
-
-        def weights_of(opacities: Tensor) -> Tensor:
-            return blend_weights(replace(splats, opacities=opacities), views, problem.backend, target) * finer**2
-
-        return matched_opacities(splats.opacities, weights, whole, weights_of, rounds)
-
-    def _matching_rounds(self, weights: Tensor | None) -> int:
-        """How many rounds opacities are matched in: none without blend weights, and no more than there is time for."""
-        rounds = wanted = self._matching if self._matches_weights and weights is not None else 0
-        while rounds and not self._clock.allows("weights", rounds):
-            rounds -= 1
-        if rounds == 0 < wanted and UNMATCHED not in self.notes:
-            self.notes.append(UNMATCHED)
-        return rounds
+        return scales, self._matcher.matched(formed, weights, self._seen.whole(gaussians, pixel), rounds)

@@ -6,10 +6,11 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.start import candidates
+from mipmap_plugin.adaptation.start import matcher
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
-from mipmap_plugin.adaptation.start.candidates import UNMATCHED
+from mipmap_plugin.adaptation.start.candidates import StartSearch
 from mipmap_plugin.adaptation.start.clock import Clock
+from mipmap_plugin.adaptation.start.matcher import UNMATCHED
 from mipmap_plugin.adaptation.start.matching import MAX_FACTOR, ROUNDS, matched_opacities
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
@@ -89,11 +90,35 @@ def test_what_hardly_shows_of_a_splat_says_little_of_its_opacity():
     assert new.item() == pytest.approx(0.3 * (1.2 / 1.1) ** ROUNDS, rel=1e-3)
 
 
+@pytest.mark.parametrize("settings", [{}, {"most_splats": 20}], ids=["all splats", "merged ones"])
 @pytest.mark.parametrize("factors", [(1.0, 0.2), (0.2, 5.0)], ids=["keeps the first", "keeps the second"])
-def test_without_steps_opacities_are_matched_once_more_and_kept_if_that_looks_better(monkeypatch, factors):
+def test_without_steps_opacities_are_matched_once_more_and_kept_if_that_looks_better(monkeypatch, factors, settings):
     base = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
-    right = opacities_by(monkeypatch, base, [1.0, 1.0])
-    torch.testing.assert_close(opacities_by(monkeypatch, base, factors), right)
+    right = opacities_by(monkeypatch, base, [1.0, 1.0], **settings)
+    torch.testing.assert_close(opacities_by(monkeypatch, base, factors, **settings), right)
+
+
+@pytest.mark.parametrize(("factor", "asked"), [(1.0, [ROUNDS, ROUNDS]), (1e-4, [ROUNDS, 1, ROUNDS])], ids=["visible", "faint"])
+def test_without_steps_opacities_that_come_out_too_faint_are_matched_in_fewer_rounds(monkeypatch, factor, asked):
+    """None of these is drawn, which looks worse than with 1 round; with none they are the closed form's, which is not matched."""
+    base, rounds = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference"), []
+
+    def matched(opacities, target, whole, weights_of, count):
+        rounds.append(count)
+        return opacities * (factor if count == ROUNDS else 1)
+
+    monkeypatch.setattr(matcher, "matched_opacities", matched)
+    found = base.adapt(1 / 4, recipe="instant", merge_to=1.0).model.gaussians(tiny.cameras()[0]).opacities
+    assert rounds == asked and found.mean() > 1e-2
+
+
+@pytest.mark.parametrize(("screen_filter", "count"), [("classic", 4), ("antialiased", 3)])
+def test_a_filter_that_draws_alike_has_no_closed_form_without_matching(monkeypatch, screen_filter, count):
+    tried, candidate = [], StartSearch._candidate
+    monkeypatch.setattr(StartSearch, "_candidate", lambda *given: tried.append(1) or candidate(*given))
+    monkeypatch.setattr(matcher, "matched_opacities", lambda opacities, *_: opacities * 1e-4)
+    wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference", screen_filter=screen_filter).adapt(1 / 4, recipe="instant", merge_to=1.0)
+    assert len(tried) == count
 
 
 def test_before_steps_opacities_are_matched_once(monkeypatch):
@@ -106,7 +131,7 @@ def test_before_steps_opacities_are_matched_once(monkeypatch):
 def opacities_by(monkeypatch, base, factors, **settings):
     """Opacities [N] at x1/4, where each matching multiplies them by the next of these factors; StopIteration if there are too few."""
     left = iter(factors)
-    monkeypatch.setattr(candidates, "matched_opacities", lambda opacities, *_: opacities * next(left))
+    monkeypatch.setattr(matcher, "matched_opacities", lambda opacities, *_: opacities * next(left))
     return base.adapt(1 / 4, recipe="instant", merge_to=1.0, **settings).model.gaussians(tiny.cameras()[0]).opacities.detach()
 
 

@@ -1,8 +1,10 @@
 """Without cameras a base and what is adapted from it are looked at from the same places."""
 
 import json
+import math
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import pytest
 import tiny
@@ -12,7 +14,7 @@ from torch_checkpoints import gsplat_folder, splatfacto_folder, splats
 from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation.shown import orbited
 from mipmap_plugin.cli import main
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import CheckpointError, SettingsError
 from mipmap_plugin.models.adapted_scale import adapted_orbit
 from mipmap_plugin.scenes.orbits import Orbit
 
@@ -70,13 +72,32 @@ def test_and_so_is_what_is_adapted_in_tiles(files, tmp_path):
         assert torch.equal(poses(tmp_path / "tiled.ply"), poses(base))
 
 
-@pytest.mark.parametrize("orbit", [None, 3, {}, {"center": [1, 2], "up": [0.0, 0.0, 1.0], "distance": 1.0}])
-def test_a_report_without_an_orbit_is_taken_as_one_of_before(files, orbit):
-    _, adapted = files
+def reported(adapted, orbit):
+    """The adapted file with this orbit in its report, and none in its header."""
     adapted.write_bytes(adapted.read_bytes().replace(b"comment mipmap_plugin {", b"comment another_plugin {"))
     report = adapted.with_name(adapted.name + ".adaptation.json")
     report.write_text(json.dumps(json.loads(report.read_text()) | {"orbit": orbit}))
+    return adapted
+
+
+def test_a_report_without_an_orbit_is_taken_as_one_of_before(files):
+    adapted = reported(files[1], None)
     assert adapted_orbit(adapted) is None and len(poses(adapted)) > 1
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"center": [1.0, 2.0]}, {"center": [math.nan, 0, 0]}, {"up": [0.0, 0.0, 0.0]}, {"distance": 0.0}, {"distance": math.inf}, {"nearest": "far"}],
+    ids=str,
+)
+def test_a_damaged_orbit_is_told_of(files, wrong):
+    adapted = reported(files[1], {"center": [1.0, 2.0, 3.0], "up": [0.0, 0.0, 1.0], "distance": 1.0, **wrong})
+    with pytest.raises(CheckpointError, match=f"{adapted.name}: the orbit around its base, which its header or its report tells, is damaged; copy"):
+        poses(adapted)
+
+
+def test_whole_numbers_are_places_too(files):
+    assert adapted_orbit(reported(files[1], {"center": [1, 2, 3], "up": None, "distance": 2}))["center"] == (1, 2, 3)
 
 
 @pytest.mark.parametrize(
@@ -157,6 +178,13 @@ def test_without_cameras_it_is_told_where_views_look_from(files, recwarn):
 def test_what_is_up_is_not_asked_for_where_colors_tell_from_where_to_look():
     lying = Orbit((0.0, 0.0, 0.0), None, 2.0, nearest=1.0)
     assert "--up" in orbited(None, lying) and "--up" not in orbited(None, replace(lying, seen="f", focal=500.0))
+
+
+def test_of_an_spz_it_is_told_that_what_is_up_may_be_guessed_wrongly():
+    """Phones write it with y up, others with the axes of a PLY."""
+    guessed = Orbit((0.0, 0.0, 0.0), (0.0, -1.0, 0.0), 2.0, nearest=1.0)
+    assert "--up y" in orbited(Path("a.spz"), guessed) and "--up" not in orbited(Path("a.ply"), guessed)
+    assert "--up" not in orbited(Path("a.spz"), replace(guessed, said=True))
 
 
 def test_what_somebody_says_is_up_is_told_with_where_a_capture_was_photographed():

@@ -1,6 +1,7 @@
 """From where a scene without cameras is looked at: of a capture by those views of its orbit that see it clearly."""
 
 import gc
+import math
 import pickle
 import weakref
 from dataclasses import replace
@@ -12,12 +13,15 @@ from lone_capture import capture
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation.optimization.amount import DRAWS_A_SECOND, FOR_LOOKS, looks_in_budget
+from mipmap_plugin.adaptation.optimization.validation import split_validation
 from mipmap_plugin.adaptation.viewpoints import FOG, LEAST_LOOKS, ROUNDS, ClearViews, Viewpoints
+from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.evaluation.measure import adapt_alone
 from mipmap_plugin.models.vanilla import VanillaModel
-from mipmap_plugin.scenes.orbits import Orbit
+from mipmap_plugin.recipes import recipe
+from mipmap_plugin.scenes.orbits import EVERY, Orbit
 
 CAPTURE, OBJECT = Orbit((0.0, 0.0, 0.0), (0.0, -1.0, 0.0), 8.0, nearest=4.0), Orbit((0.0, 0.0, 0.0), None, 8.0)
 COUNT = 12
@@ -134,11 +138,34 @@ def lone_capture():
 
 
 @pytest.mark.filterwarnings("ignore:no ")
-def test_views_that_are_adapted_to_are_finer_but_not_those_that_stand_for_the_training():
+def test_views_that_are_adapted_to_are_finer_but_not_those_that_stand_for_the_training(monkeypatch):
     """From those follow the distances of a ladder."""
+    monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 200)  # a finer view of fewer shows little but a splat or two
     lone = wrap_model(VanillaModel.from_gaussians(capture().to(dtype=torch.float32)))
     details = [{round(view.fx / 10) for view in views} for views in (lone.views(), lone.adapt(1 / 4, recipe="instant", extra_views=20).adapted_to)]
     assert [len(each) for each in details] == [2, 4]  # from near and from far
+
+
+def are_finer(views):
+    """Of each view of `CAPTURE`, with a focal length of 10 px from 4 units away, whether it is finer."""
+    return [view.fx > 1.5 * 10 * float(view.center.norm()) / 4 for view in views]
+
+
+@pytest.mark.parametrize(("name", "count"), [("instant", 1), ("default", 2)])
+def test_whatever_is_clear_as_many_of_the_views_that_choose_are_finer_as_of_those_that_steer(name, count):
+    """A fifth of those that are adapted to, and about as many of each half of the views for validation."""
+    config, somewhere = recipe(name, 1 / 4), Viewpoints(replace(CAPTURE, focal=10.0), lambda views: [view for view in views if on_one_side(view)])
+    views, _ = choose_views([], somewhere, config)
+    adapted, validation = split_validation([], views, somewhere, 1 / 4, config)
+    assert sum(are_finer(adapted)) == len(adapted) / EVERY
+    assert [sum(are_finer(half)) for half in (validation[::2], validation[1::2])] == [count, count]
+
+
+@pytest.mark.parametrize(("looks", "finer"), [(math.inf, 0), (COUNT, 2)])
+def test_a_finer_view_that_is_not_clear_is_not_taken_and_a_budget_is_not_spent_on_looking(looks, finer):
+    orbit = replace(CAPTURE, focal=10.0)
+    somewhere = Viewpoints(orbit, lambda views: [view for view, fine in zip(views, are_finer(views), strict=True) if not fine], looks)
+    assert sum(are_finer(somewhere.views((32, 32), COUNT, torch.Generator().manual_seed(0)))) == finer
 
 
 @pytest.mark.filterwarnings("ignore:no cameras are known")
