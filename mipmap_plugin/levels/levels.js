@@ -58,7 +58,7 @@ export class Levels extends Group {
     const projection = camera.projectionMatrix.elements // by columns: 5 is twice the focal length over the height, 15 is 1 without perspective
     const distance = projection[15] === 1 ? 1 : middle.distanceTo(new Vector3().setFromMatrixPosition(camera.matrixWorld))
     const pixel = (2 * distance) / (projection[5] * renderer.getDrawingBufferSize(new Vector2()).y)
-    return (this.manifest.base_pixel * new Vector3().setFromMatrixScale(this.matrixWorld).x) / pixel
+    return (this.manifest.view_pixel * new Vector3().setFromMatrixScale(this.matrixWorld).x) / pixel
   }
 
   // The number of the level that is to be shown at a zoom: 0 is the finest.

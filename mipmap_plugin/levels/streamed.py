@@ -53,9 +53,12 @@ TOO_SMALL = "PlayCanvas changes no level nearer than {least:g} units, and level 
 MOVED = 1 / 50
 
 
-def distances(manifest: dict[str, Any], canvas: int) -> list[float]:
-    """The distances from splats, in world units and a field of view of 45°, at which the levels of a ladder should be switched, rising."""
-    return [canvas / 2 * manifest["base_pixel"] / (math.tan(math.pi / 8) * switch["zoom"]) for switch in manifest["switches"]]
+def distances(manifest: dict[str, Any], canvas: int, pixel: str = "base_pixel") -> list[float]:
+    """The distances from splats, in world units and a field of view of 45°, at which the levels of a ladder should be switched, rising.
+
+    `pixel`: the key of the manifest that says how large a base pixel is.
+    """
+    return [canvas / 2 * manifest[pixel] / (math.tan(math.pi / 8) * switch["zoom"]) for switch in manifest["switches"]]
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,7 +64,8 @@ def errors(manifest: dict[str, Any], approach: Approach | None, canvas: int) -> 
     `approach`: to the box of all levels; None for a ladder by distance, whose levels are made for distances from boxes. `canvas`: its shorter side in
     px, on which the camera's distance depends.
     """
-    away, pixels = distances(manifest, canvas), [manifest["base_pixel"] / switch["zoom"] for switch in manifest["switches"]]
+    pixel = "view_pixel" if approach else "base_pixel"
+    away, pixels = distances(manifest, canvas, pixel), [manifest[pixel] / switch["zoom"] for switch in manifest["switches"]]
     nearness = [approach.near(distance) / distance if approach else 1.0 for distance in away]
     return [0.0, *(SCREEN_ERROR * pixel * near for pixel, near in zip(pixels, nearness, strict=True))]
 

@@ -49,7 +49,7 @@ def seen_at(ladder: Path, zoom: float) -> Camera:
     middle, rotation = torch.tensor(manifest["middle"], dtype=torch.float64), camera.viewmat[:3, :3]
     away = -(rotation.T @ camera.viewmat[:3, 3]) - middle
     viewmat = camera.viewmat.clone()
-    viewmat[:3, 3] = -(rotation @ (middle + away / away.norm() * camera.fy * manifest["base_pixel"] / zoom))
+    viewmat[:3, 3] = -(rotation @ (middle + away / away.norm() * camera.fy * manifest["view_pixel"] / zoom))
     return replace(camera, viewmat=viewmat)
 
 
@@ -70,7 +70,7 @@ def test_nothing_flickers_at_a_switch(page: Page, ladder: Path) -> None:
 
 def test_a_ladder_that_is_turned_and_enlarged_changes_where_it_looks_the_same(page: Page, ladder: Path) -> None:
     """A page twice as large, seen from twice as far away, is at the same zoom; upside down too."""
-    (middle, pixel), camera = (read_manifest(ladder)[key] for key in ("middle", "base_pixel")), embedded().cameras[0]
+    (middle, pixel), camera = (read_manifest(ladder)[key] for key in ("middle", "view_pixel")), embedded().cameras[0]
     x, y, z = (2 * each for each in middle)
     page.place((5.0, 0.0, 0.0), UPRIGHT, 2.0)
     eye = torch.tensor([5.0 + x, -y, -z - 2 * camera.fy * pixel / 0.3], dtype=torch.float64)

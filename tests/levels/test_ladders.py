@@ -17,7 +17,7 @@ from mipmap_plugin.commands.ladder_summary import print_summary
 from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.levels.contents import LeftOut, Level
 from mipmap_plugin.levels.ladder import NO_FEWER, NOT_BETTER, UNSHOWN, _no_use, _shown, _Work, make_levels
-from mipmap_plugin.levels.manifest import MANIFEST, THREE_JS, base_pixel, read_manifest, refuse_ladder
+from mipmap_plugin.levels.manifest import MANIFEST, THREE_JS, base_pixel, read_manifest, refuse_ladder, view_pixel
 from mipmap_plugin.levels.request import MERGING_COSTS, Band
 from mipmap_plugin.models.places import state_path
 from mipmap_plugin.models.vanilla import VanillaModel
@@ -150,7 +150,7 @@ def test_the_views_of_the_training_are_at_x1_by_what_they_look_at():
     """Not by what is closest to one of them: viewers would change levels nearer than these are measured."""
     views, ball = [camera.zoomed(scale) for camera, scale in zip(tiny.cameras(3), (1, 1, 2), strict=True)], tiny.gaussians(500, spread=0.3)
     away = float((views[0].center - ball.means.double().median(0).values).norm())
-    assert base_pixel(wrap_model(VanillaModel.from_gaussians(ball), cameras=views)) == pytest.approx(away / views[0].fx, rel=0.05)
+    assert view_pixel(wrap_model(VanillaModel.from_gaussians(ball), cameras=views)) == pytest.approx(away / views[0].fx, rel=0.05)
 
 
 def test_a_ladder_is_saved_when_its_base_is_gone(tmp_path):
