@@ -57,6 +57,7 @@ def at_whole_numbers(g, camera, effects):
         (Wrong(turned), "reads quaternions as xyzw"),
         (with_scales(2), "^the gradient of scales is 2 times the right one$"),
         (with_scales(-1), "^the gradient of scales is -1 times the right one$"),
+        (with_scales(1.004), "^$"),  # as much as a pixel on a cut-off may do to a right one
         (with_scales(0), "^the gradient of scales is 0 everywhere$"),
         (Wrong(returned=lambda rendered, effects: Rendered(rendered.image.sqrt(), rendered.alpha)), "^$"),  # nothing usual
     ],
