@@ -99,7 +99,7 @@ def _sh_negated(*functions: int) -> Callable[[HardCase], Tensor]:
 # Sentence -> the image in which a scene is drawn so.
 FAULTS: dict[str, Callable[[HardCase], Tensor]] = {
     "pixel centers lie at whole numbers in it, and have to lie at +0.5": partial(_shifted, pixels=0.5),
-    "its image is shifted by half a pixel to the right and down; pixel centers lie at +0.5, once": partial(_shifted, pixels=-0.5),
+    "its image is shifted by half a pixel to the left and up; pixel centers lie at +0.5, once": partial(_shifted, pixels=-0.5),
     "it leaves the background out; add (1 - alpha) * effects.background": partial(_with_effects, background=(0.0, 0.0, 0.0)),
     "it dilates by 0.3 px² always, and not by effects.eps2d": partial(_with_effects, eps2d=DILATION),
     "it does not dilate by effects.eps2d": partial(_with_effects, eps2d=0.0),
