@@ -19,11 +19,15 @@ import { Group, Vector2, Vector3 } from 'three'
 const STAYS = 1.02
 
 export class Levels extends Group {
-  // `open`: makes of the URL of a level's file what draws it, an Object3D. `folder`: URL of the ladder, this module's by default.
+  // `open`: makes of the URL of a level's file what draws it, an Object3D, or a promise of it. `folder`: where the ladder lies, a URL or the path of
+  // one; by default where this module lies.
   static async load(open, folder = new URL('.', import.meta.url)) {
-    const answer = await fetch(new URL('levels.json', folder))
+    const whole = new URL(`${folder}`.replace(/\/?$/, '/'), location.href)
+    const answer = await fetch(new URL('levels.json', whole))
     if (!answer.ok) throw new Error(`${answer.url}: ${answer.status} ${answer.statusText}`)
-    const levels = new Levels(await answer.json(), (file) => open(new URL(file, folder).href))
+    const manifest = await answer.json()
+    if (!manifest.middle) throw new Error(`${answer.url} is of a ladder by distance, or of an earlier version: make one by zoom (--by zoom)`)
+    const levels = new Levels(manifest, (file) => open(new URL(file, whole).href))
     await levels.opened(levels.wanted)
     return levels
   }
@@ -66,13 +70,16 @@ export class Levels extends Group {
     return this.manifest.switches.filter((each) => zoom < each.zoom).length
   }
 
-  // Resolves once a level is there.
+  // Resolves once a level is there. One that failed is not tried again.
   opened(level) {
-    this.opening[level] ??= this.open(this.manifest.levels[level].file).then((splats) => {
-      splats.visible = false
-      this.drawn[level] = splats
-      this.add(splats)
-    })
+    this.opening[level] ??= this.#open(level)
     return this.opening[level]
+  }
+
+  async #open(level) {
+    const splats = await this.open(this.manifest.levels[level].file)
+    splats.visible = false
+    this.drawn[level] = splats
+    this.add(splats)
   }
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial, wraps
 from threading import Lock
 from typing import Any, ParamSpec, TypeVar
@@ -39,10 +39,10 @@ def usual_modes() -> Iterator[None]:
         yield
 
 
-def opaque(function: Callable[P, T], modes: Callable[[], AbstractContextManager[None]] = nullcontext) -> Callable[P, T]:
+def opaque(function: Callable[P, T], modes: Callable[[], AbstractContextManager[None]] = of_fork) -> Callable[P, T]:
     """The function, which torch.compile runs as it is, and torch.func refuses with a SettingsError: neither can look into compiled kernels.
 
-    `modes`: a context that it runs in.
+    `modes`: a context that it runs in; by default only what a process that was forked needs.
     """
 
     @wraps(function)

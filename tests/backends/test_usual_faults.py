@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 
 import pytest
@@ -42,8 +43,9 @@ def turned(g, *rest):
     return replace(g, quats=g.quats[:, [3, 0, 1, 2]]), *rest
 
 
-def at_whole_numbers(g, camera, effects):
-    return g, replace(camera, cx=camera.cx + 0.5, cy=camera.cy + 0.5), effects
+def shifted(by, g, camera, effects):
+    """What is seen lies so many px farther to the right and down."""
+    return g, replace(camera, cx=camera.cx + by, cy=camera.cy + by), effects
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -52,11 +54,13 @@ def at_whole_numbers(g, camera, effects):
     [
         (ReferenceBackend(), "^$"),
         (Wrong(returned=without_background), "leaves the background out"),
-        (Wrong(at_whole_numbers), "pixel centers lie at whole numbers"),
+        (Wrong(partial(shifted, 0.5)), "pixel centers lie at whole numbers"),
+        (Wrong(partial(shifted, -0.5)), "shifted by half a pixel to the left and up"),
         (Wrong(lambda g, camera, effects: (g, camera, replace(effects, eps2d=0.3))), "dilates by 0.3 px² always"),
         (Wrong(turned), "reads quaternions as xyzw"),
         (with_scales(2), "^the gradient of scales is 2 times the right one$"),
         (with_scales(-1), "^the gradient of scales is -1 times the right one$"),
+        (with_scales(1.004), "^$"),  # as much as a pixel on a cut-off may do to a right one
         (with_scales(0), "^the gradient of scales is 0 everywhere$"),
         (Wrong(returned=lambda rendered, effects: Rendered(rendered.image.sqrt(), rendered.alpha)), "^$"),  # nothing usual
     ],

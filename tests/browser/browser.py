@@ -116,6 +116,10 @@ class Browser:
         _told(viewer, shown, "([url, component]) => viewer.open(url, component)", [f"{url}/lod-meta.json", component])
         return Page(viewer, shown)
 
+    def alone(self, script: str, folder: Path) -> Any:
+        """What the script `pages/{script}.js` tells of a folder."""
+        return _told(script, self._started(script, {}), "url => viewer.told(url)", self._served(folder))
+
     def ladder(self, folder: Path) -> Page:
         """The folder of a ladder in Spark, by the module for three.js in it."""
         url, shown = self._served(folder), self._started("spark-levels", {})

@@ -14,7 +14,9 @@ from anchor_checkpoints import write
 from running import wait_until
 
 from mipmap_plugin.adaptation.target.base_images import BaseImages
+from mipmap_plugin.backends import get_backend
 from mipmap_plugin.commands.common import wrap
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.models import load_model
@@ -249,6 +251,14 @@ def test_a_forked_worker_that_gives_torch_no_number_of_threads_ends_too():
             large.exp()
 
     ends_when_forked(work)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_forked_worker_that_draws_with_the_kernels_themselves_ends_too():
+    gaussians, [camera], backend = tiny.gaussians(20), tiny.cameras(1, width=100, height=100), get_backend("cpu")
+    backend.render(gaussians, camera, Effects())  # compiled ahead of the fork
+    ends_when_forked(lambda _: backend.render(gaussians, camera, Effects()))
 
 
 def ends_when_forked(work):

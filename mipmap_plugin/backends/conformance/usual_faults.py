@@ -13,7 +13,7 @@ from torch import Tensor
 from mipmap_plugin.backends.base import Backend, Needs
 from mipmap_plugin.backends.conformance.cases import HardCase, random_scene
 from mipmap_plugin.backends.conformance.checks import Answer, draw, lowered
-from mipmap_plugin.backends.conformance.tolerance import differing_images, tolerance_for
+from mipmap_plugin.backends.conformance.tolerance import Tolerance, differing_images, tolerance_for
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.screen_filters import DILATION
 from mipmap_plugin.splatting.harmonics import C0
@@ -24,7 +24,7 @@ FILTERS, EPS2D = ("classic", "antialiased", "mip"), 0.1
 # What is added to colors, so that none is negative, and taken from the image again.
 ABOVE_ALL_COLORS = 100.0
 
-# By how much the cosine of a multiple of a gradient may differ from 1, and its length from the right one: rounding in float32.
+# By how much the cosine of a multiple of a gradient may differ from 1: rounding in float32.
 ALONG = 1e-3
 
 
@@ -41,19 +41,19 @@ def usual_fault(backend: Backend, *, dtype: torch.dtype = torch.float32, device:
     actual, expected = draw(backend, case, differentiate=differentiate), draw(ReferenceBackend(), exact)
     tolerance = tolerance_for(dtype)
     if not differing_images("image", actual.image, expected.image, tolerance):
-        return _of_gradients(actual, expected)
+        return _of_gradients(actual, expected, tolerance)
     alike = (said for said, mistaken in FAULTS.items() if not differing_images("image", actual.image, mistaken(exact), tolerance))
     return next(alike, "")
 
 
-def _of_gradients(actual: Answer, expected: Answer) -> str:
+def _of_gradients(actual: Answer, expected: Answer, tolerance: Tolerance) -> str:
     """Which field's gradient is missing, or a multiple of the right one."""
     for field, gradient in actual.gradients.items():
         right = expected.gradients[field].flatten()
         length, cosine = float(gradient.norm() / right.norm()), float(torch.cosine_similarity(gradient.flatten(), right, dim=0))
         if length == 0:
             return f"the gradient of {field} is 0 everywhere"
-        if abs(cosine) > 1 - ALONG and abs(cosine * length - 1) > ALONG:
+        if abs(cosine) > 1 - ALONG and abs(cosine * length - 1) > tolerance.length:
             return f"the gradient of {field} is {cosine * length:.3g} times the right one"
     return ""
 
@@ -99,7 +99,7 @@ def _sh_negated(*functions: int) -> Callable[[HardCase], Tensor]:
 # Sentence -> the image in which a scene is drawn so.
 FAULTS: dict[str, Callable[[HardCase], Tensor]] = {
     "pixel centers lie at whole numbers in it, and have to lie at +0.5": partial(_shifted, pixels=0.5),
-    "its image is shifted by half a pixel to the right and down; pixel centers lie at +0.5, once": partial(_shifted, pixels=-0.5),
+    "its image is shifted by half a pixel to the left and up; pixel centers lie at +0.5, once": partial(_shifted, pixels=-0.5),
     "it leaves the background out; add (1 - alpha) * effects.background": partial(_with_effects, background=(0.0, 0.0, 0.0)),
     "it dilates by 0.3 px² always, and not by effects.eps2d": partial(_with_effects, eps2d=DILATION),
     "it does not dilate by effects.eps2d": partial(_with_effects, eps2d=0.0),

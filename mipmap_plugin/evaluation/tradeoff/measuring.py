@@ -169,7 +169,7 @@ def left_out(model: Wrapped, plan: Plan) -> list[str]:
 def _measured(point: Point, show: RenderView, truth: GroundTruth, repeats: int) -> Point:
     """Measure the PSNR and the milliseconds per frame of a point: the means over the views in each repeat."""
     times, psnrs = [], []
-    with torch.no_grad(), threads.limited_for(get_backend(point.backend), None):
+    with torch.no_grad(), threads.limited(None, shared=True):
         watch = warm_stopwatch(show, truth.views[0])
         for repeat in range(repeats):
             watch.seconds = 0.0
@@ -209,6 +209,7 @@ def _renderers(model: Wrapped, adapted: Adapted | None, scale: float) -> Iterato
 def _render_with(backend: Backend, model: SplatModel, effects: Effects, dtype: torch.dtype, scale: float) -> RenderView:
     def show(view: Camera) -> Tensor:
         camera = view.zoomed(scale)
-        return backend.render(model.gaussians(camera).to(dtype=dtype), camera, effects).image
+        with threads.limited_for(backend, None):
+            return backend.render(model.gaussians(camera).to(dtype=dtype), camera, effects).image
 
     return show

@@ -11,6 +11,7 @@ import pytest
 import tiny
 import torch
 
+from mipmap_plugin.backends import BACKENDS
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.commands.resuming import resumable
 from mipmap_plugin.errors import OutputExists, SettingsError
@@ -50,6 +51,15 @@ def test_photographs_are_the_truth_where_there_are_any(tmp_path):
     assert poses(yardstick.views) <= poses(camera for camera in scene.cameras if camera.split == "test")
     good, bad = model.render(yardstick.views[0].zoomed(1 / 4), 1 / 4, "scaled", 4).image, torch.zeros(6, 8, 3)
     assert yardstick.psnr(yardstick.views[0], good) > 30 > yardstick.psnr(yardstick.views[0], bad)
+
+
+def test_a_backend_is_measured_that_is_registered_by_another_name_than_its_own():
+    class Theirs(ReferenceBackend):
+        name = "theirs"
+
+    with BACKENDS.temporarily(mine=Theirs):
+        points = list(measure(wrapped(), base_itself(wrapped(), 1 / 2, 1), 1 / 2, replace(PLAN, recipes=("instant",), backends=("mine",), repeats=1)))
+    assert {point.backend for point in points} == {"theirs"}
 
 
 def test_a_maximum_of_steps_is_one_run_of_a_recipe_without_steps():
