@@ -105,27 +105,32 @@ def _parse(words: Sequence[str]) -> None:
 
 
 def _at_home(word: str) -> str:
-    """Replace "~" at the beginning of a word, or of an option's value. Shells do not after "=" and within quotes, and that of Windows never does."""
+    """Replace "~" at the beginning of a word, or of an option's value. Shells do not after "=" and within quotes, and that of Windows never does.
+
+    Raises SettingsError for a word with a zero byte, which no shell passes on, but `main` may be called with.
+    """
+    if "\0" in word:
+        raise SettingsError(f"{word!r} holds a zero byte, which no path and no option does; leave it out")
     option, equals, value = word.rpartition("=") if word.startswith("--") else ("", "", word)
     return option + equals + os.path.expanduser(value)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The entry point; returns the exit code."""
-    words = [_at_home(word) for word in (sys.argv[1:] if arguments is None else arguments)]
+    given = [*(sys.argv[1:] if arguments is None else arguments)]
     voice.take_any_text()
-    if words == ["--version"]:
+    if given == ["--version"]:
         print(f"mipmap-plugin {version('mipmap-plugin')}")
         return 0
     keep_freed_memory()
     leave_at_exit()
     try:
-        words, quiet, log = voice.options(words)
+        words, quiet, log = voice.options([_at_home(word) for word in given])
         common.WORDS.set(tuple(words))
         with voice.speaking(quiet, log):
             voice.detail(common.this_command())
             return _run(words)
-    except MipmapPluginError as error:  # of these two options
+    except MipmapPluginError as error:  # of these two options, or of a word that can be none
         voice.complain(f"mipmap-plugin: {error}")
         return 2
 

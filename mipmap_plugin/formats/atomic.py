@@ -115,9 +115,15 @@ def _as_output_error(path: Path) -> Iterator[None]:
 
 
 def absolute(path: Path) -> Path:
-    """`path` as an absolute path with links resolved except in its last part, which is replaced. Raises OutputError for a root."""
+    """`path` as an absolute path with links resolved except in its last part, which is replaced.
+
+    Raises OutputError for a root, and for what is no path.
+    """
     last = path.name not in ("", "..")
-    real = Path(os.path.realpath(path.parent), path.name) if last else Path(os.path.realpath(path))
+    try:
+        real = Path(os.path.realpath(path.parent), path.name) if last else Path(os.path.realpath(path))
+    except ValueError as error:
+        raise _is_no_path(path, error) from None
     if not real.name:
         raise OutputError(f"{path} is the root of a disk; choose a path below it")
     return real
@@ -216,8 +222,13 @@ def _stat(path: Path) -> os.stat_result | None:
         if path.is_symlink():
             raise OutputExists(f"{path} is a link to something that is not there; remove it, or choose another path") from None
         return None
-    except ValueError as error:  # a zero byte
-        raise OutputError(f"{str(path)!r} is no path: {error}") from None
+    except ValueError as error:
+        raise _is_no_path(path, error) from None
+
+
+def _is_no_path(path: Path, error: ValueError) -> OutputError:
+    """What is said of a path with a zero byte, or with a character that no file's name can have."""
+    return OutputError(f"{str(path)!r} is no path: {error}")
 
 
 def _around(file: Path, folders: bool) -> Iterator[os.stat_result]:

@@ -230,9 +230,11 @@ def _with_surplus(path: Path, header: Header, surplus: int) -> Header:
 
 def _read_through_plyfile(path: Path, header: Header, wanted: Element) -> np.ndarray:
     """Rows of varying length, parsed by plyfile with a normalized header."""
+    in_text = header.format == "ascii"
     declared = [f"ply\nformat {header.format} 1.0\n"]
     for element in header.elements:
-        declared += [f"element {element.name} {element.count}\n", *(f"property {kind} {name}\n" for name, kind in element.properties)]
+        kinds = ((name, "double" if in_text and _is_integer(kind) else kind) for name, kind in element.properties)  # `_in_declared_types`
+        declared += [f"element {element.name} {element.count}\n", *(f"property {kind} {name}\n" for name, kind in kinds)]
         if element is wanted:
             break
     with path.open("rb") as file:
@@ -240,6 +242,24 @@ def _read_through_plyfile(path: Path, header: Header, wanted: Element) -> np.nda
         content = "".join([*declared, "end_header\n"]).encode() + file.read()
     try:
         rows: np.ndarray = PlyData.read(io.BytesIO(content))[wanted.name].data
-        return rows
+        return _in_declared_types(rows, wanted) if in_text else rows
     except (PlyParseError, ValueError, OverflowError) as error:
         raise CheckpointError(f"{path} is damaged or truncated ({error}); download or export it again") from error
+
+
+def _is_integer(kind: str) -> bool:
+    """Whether a type is one of whole numbers, which doubles hold exactly; a list is none."""
+    return TYPES.get(kind, "f")[0] in "iu"
+
+
+def _in_declared_types(rows: np.ndarray, element: Element) -> np.ndarray:
+    """Rows whose integers were parsed as doubles, in the types of the header. Raises ValueError for numbers that these do not hold.
+
+    NumPy 1 would take such numbers, parsed as integers, modulo the size of the type, without a word.
+    """
+    with np.errstate(invalid="ignore"):
+        typed = rows.astype(element.dtype("="))
+    for name, kind in element.properties:
+        if _is_integer(kind) and (wrong := typed[name] != rows[name]).any():
+            raise ValueError(f"{rows[name][wrong][0]:.17g} is no {kind}, which {name} is declared to be")
+    return typed

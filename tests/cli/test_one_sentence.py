@@ -189,6 +189,12 @@ def test_an_empty_word_is_not_this_folder(run, words):
     refused(run(*words), "a word of this command is empty")
 
 
+@pytest.mark.parametrize("words", [["adapt", "a\0b", "--scale", "1/4"], ["demo", "--output", "a\0b/c"], ["list", "viewers", "--log", "~a\0b"]])
+def test_a_word_with_a_zero_byte_is_refused(run, words):
+    """It ended in a traceback, where the system was asked for a path below it."""
+    assert refused(run(*words), "holds a zero byte").startswith("mipmap-plugin: '")
+
+
 @pytest.mark.parametrize("words", ["adapt --scale 25%", "adapt --viewers spark", "adapt --up up", "levels a b"])
 def test_a_mistake_points_to_the_help_of_its_command(run, words):
     command = words.split()[0]

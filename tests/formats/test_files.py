@@ -60,7 +60,7 @@ def test_a_link_is_replaced_and_what_it_leads_to_stays(tmp_path):
     assert ((tmp_path / "far").read_text(), (tmp_path / "near").read_text()) == ("precious", "new")
 
 
-@pytest.mark.parametrize("path", ["/", "", ".", "..", "a/..", "x" * 300, f"{'x' * 300}/a", "a\0b"])
+@pytest.mark.parametrize("path", ["/", "", ".", "..", "a/..", "x" * 300, f"{'x' * 300}/a", "a\0b", "a\0b/c", "\ud800", "\ud800/a"])
 def test_paths_that_no_file_can_have_end_in_one_sentence(tmp_path, monkeypatch, path):
     monkeypatch.chdir(tmp_path)
     with pytest.raises((OutputExists, OutputError)):

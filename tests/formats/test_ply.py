@@ -49,6 +49,13 @@ def test_mixed_types_keep_their_values(tmp_path):
     assert [held[name][0] for name in columns] == [0.1, 2**31 - 1, 255]
 
 
+def test_text_holds_the_largest_numbers_of_each_type(tmp_path):
+    lines = header("format ascii 1.0", "element vertex 1", "property uint a", "property char b", "property double c", "end_header")
+    (tmp_path / "a.ply").write_bytes(lines + b"4294967295 -128 0.1\n")
+    held = read_ply(tmp_path / "a.ply").columns
+    assert [(column.dtype, column[0]) for column in held.values()] == [(np.uint32, 2**32 - 1), (np.int8, -128), (np.float64, 0.1)]
+
+
 def test_keeps_comments_and_obj_info_of_any_alphabet(tmp_path):
     lines = header("format ascii 1.0", "comment Brüder", "element vertex 1", "obj_info two", "comment three", "property float x", "end_header")
     (tmp_path / "a.ply").write_bytes(lines.replace(b"\xc3\xbc", b"\xfc") + b"1\n")
@@ -121,7 +128,8 @@ MALFORMED = {
     "hostile ascii": (header("format ascii 1.0", "element vertex 99999999999999", F4, "end_header") + b"1\n2\n", "are missing"),
     "short ascii": (header("format ascii 1.0", "element vertex 2", F4, "end_header") + b"1.00\n", "damaged or truncated"),
     "words": (header("format ascii 1.0", "element vertex 1", F4, "end_header") + b"one\n", "damaged or truncated"),
-    "too large": (header("format ascii 1.0", "element vertex 1", "property uchar x", "end_header") + b"300\n", "damaged or truncated"),
+    "too large": (header("format ascii 1.0", "element vertex 1", "property uchar x", "end_header") + b"300\n", "300 is no uchar, which x is decl"),
+    "a fraction": (header("format ascii 1.0", "element vertex 1", "property int x", "end_header") + b"1.5\n", "1.5 is no int, which x is declared"),
 }
 
 

