@@ -28,7 +28,7 @@ def told(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> dict[str
     folder = tmp_path_factory.mktemp("ladder")
     shutil.copyfile(Path(manifest.__file__).with_name(THREE_JS), folder / THREE_JS)
     levels, switches = [{"file": f"level_{number}.ply"} for number in range(3)], [{"zoom": 0.5}, {"zoom": 0.2}]
-    (folder / MANIFEST).write_text(json.dumps({"middle": MIDDLE, "base_pixel": BASE_PIXEL, "levels": levels, "switches": switches}))
+    (folder / MANIFEST).write_text(json.dumps({"middle": MIDDLE, "view_pixel": BASE_PIXEL, "levels": levels, "switches": switches}))
     (folder / "distance").mkdir()
     (folder / "distance" / MANIFEST).write_text(json.dumps({"by": "distance", "levels": levels}))
     for number in (0, 2):
