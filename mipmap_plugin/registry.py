@@ -77,7 +77,7 @@ class Registry:
 
     def is_only_here(self, name: Any) -> bool:
         """Whether what has this name was registered in this process, so that no other knows it."""
-        return name in self._targets and self._targets[name] is not self._built_in.get(name) and name not in self._installed()
+        return name in self._targets and self._targets[name] != self._built_in.get(name) and name not in self._installed()
 
     def _installed(self) -> Mapping[str, str]:
         return _points(entry_points, self.group, tuple((folder, _modified(folder)) for folder in sys.path))

@@ -18,6 +18,7 @@ from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats import zipped
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.models import detect, load_model, zipped_folder
+from mipmap_plugin.recipes import register_recipe
 
 pytestmark = pytest.mark.usefixtures("few_views")
 
@@ -197,6 +198,7 @@ def test_workers_leave_nothing_unpacked(tmp_path, folder, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", None)
     for name in ("a", "b"):
         packed(tmp_path / f"{name}.zip", folder)
+    register_recipe("instant", "mipmap_plugin.recipes:instant", replace=True)  # what workers know
     assert main(["adapt", str(tmp_path / "*.zip"), "--scale", "1/2", "--recipe", "instant", "--jobs", "2"]) == 0
     assert len(list((tmp_path / "temporary").glob("mipmap-plugin-*"))) == 2  # of this process, which has not ended
     assert (tmp_path / "a_x0.5").is_dir() and (tmp_path / "b_x0.5").is_dir()
