@@ -56,9 +56,9 @@ def write_levels(levels: Sequence[Adapted], manifest_of: Callable[[list[Path]], 
     OutputError."""
     with new_folder(folder, overwrite) as temporary:
         files = [level.save(temporary / f"level_{number}.ply") for number, level in enumerate(levels)]  # 0 is the finest, as in other tools
-        manifest = manifest_of(files)
-        write_json(temporary / MANIFEST, manifest, overwrite=False)
-        if "middle" in manifest:  # the module shows ladders by zoom
+        facts = manifest_of(files)
+        write_json(temporary / MANIFEST, facts, overwrite=False)
+        if "middle" in facts:  # the module shows ladders by zoom
             shutil.copyfile(Path(__file__).with_name(THREE_JS), temporary / THREE_JS)
     return folder
 
@@ -94,8 +94,8 @@ def manifest(ladder: Contents, files: list[Path]) -> dict[str, Any]:
 def base_pixel(base: FrozenBase) -> float:
     """The size in world units of a pixel of the base at its median splat of those in a picture, in the closest view; of all, if none is.
 
-    It is for viewers that choose a level for each part of a scene: PlayCanvas shows flowers with up to 1.2 dB more than by `view_pixel`, and lego
-    with as many from fewer splats.
+    It is for viewers that choose a level for each part of a scene: drawn as PlayCanvas does, flowers have up to 1.2 dB more than by `view_pixel`,
+    and lego has as many from fewer splats.
     """
     means, views = base.model.parameters()["means"].detach(), base.views()
     seen = seen_pixel_size(means, views, base.effects().near_plane)
@@ -105,7 +105,7 @@ def base_pixel(base: FrozenBase) -> float:
 def view_pixel(base: FrozenBase) -> float:
     """The size in world units of a pixel of the base at what its views look at: the median over views, each at the median splat of its picture.
 
-    It is for viewers that change the whole scene at once: by `base_pixel` Spark would show lego with up to 3 dB less. Where no picture has any splat,
+    It is for viewers that change the whole scene at once: by `base_pixel` Spark showed lego with up to 4 dB less. Where no picture has any splat,
     at the median splat of all.
     """
     means, near = base.model.parameters()["means"].detach(), base.effects().near_plane
