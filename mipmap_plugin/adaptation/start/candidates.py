@@ -167,7 +167,7 @@ class StartSearch:
         `whole`: as of `Matcher.matched`; `copied`: makes a model of the same splats, whose scales and opacities may be others.
         """
         problem, sweeps = self._problem, self._matcher.sweeps.further
-        if not self._clock.allows("weights", len(sweeps)):
+        if not self._matcher.allows(weights, sweeps):
             return formed, quality
         further, splats = copied(), formed.gaussians(problem.views[0]).detach()
         with problem.phase("closed form"):
