@@ -140,7 +140,7 @@ class StartSearch:
             return formed, quality
         less, better = self._matched_less(formed, quality, weights)
         further, best = self._matched_further(formed, quality, weights, self._seen.whole_of_base, self._problem.base)
-        if better.visible > best.visible:
+        if less is not formed and better.visible > best.visible:
             return less, better
         self._matcher.wanted = None if further is formed else (*self._matcher.sweeps.usual, *self._matcher.sweeps.further)  # of merged splats too
         return further, best
