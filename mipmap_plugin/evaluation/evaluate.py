@@ -89,12 +89,9 @@ class Evaluator:
         recorder.replay(known, self.views[0].camera)
         return Row(**known["row"])
 
+    @threads.limited(None, shared=True)  # small images take many times as long on torch's threads where the machine is busy
     def row(self, name: str, scale: float, show: RenderView, **facts: Any) -> Row:
         """The mean quality of `show(camera at the base scale)` over the views. PSNRs of views are averaged, as in the literature."""
-        with threads.limited(None, shared=True):  # small images take many times as long on torch's threads where the machine is busy
-            return self._row(name, scale, show, facts)
-
-    def _row(self, name: str, scale: float, show: RenderView, facts: dict[str, Any]) -> Row:
         psnrs, similarities, distances = [], [], []
         watch = warm_stopwatch(show, self.views[0].camera)
         for view in Bar(self.views, desc=f"{name} x{scale:g}", leave=False):
