@@ -112,7 +112,7 @@ class Camera:
             if getattr(self, name) is not None or name.endswith("zoom"):
                 object.__setattr__(self, name, self._number(name, kind))
         if not math.isfinite(self.time or 0) or not all(0 < zoom < math.inf for zoom in (self.zoom, self.base_zoom)):
-            raise SettingsError(f"camera {self.name!r}: time must be finite, and zoom a number above 0, got {self.time} and {self.zoom}")
+            raise SettingsError(f"camera {self.name!r}: time must be finite, zooms above 0, got {self.time}, {self.zoom} and {self.base_zoom}")
 
     def _check_intrinsics(self) -> None:
         """Check the intrinsics and the size, and convert them to types of Python. Raises SettingsError."""

@@ -231,8 +231,10 @@ class FrozenBase:
         refuse_unwritable(path, 0 if source is None else source.stat().st_size)
 
     def targets(self, viewer: str | None, cameras: Sequence[Camera] = ()) -> dict[str, Effects]:
-        """How an adapted file for `viewer` is rendered, by viewer: several for "portable", and one named "" for None; as the base's training did
-        where these `cameras`, by default the base's `views`, show no difference. Raises SettingsError for a model whose splats no viewer renders.
+        """How an adapted file for `viewer` is rendered, by viewer: several for "portable", and one named "" for None.
+
+        Where `cameras`, by default the base's `views`, see no difference of a viewer from the base's training, the file is rendered as that did.
+        Raises SettingsError for a model whose splats no viewer renders.
         """
         if viewer is None:
             return {"": self.effects()}

@@ -58,7 +58,7 @@ CONFINED = {
     "numpy": ["backends/", "evaluation/metrics.py", "formats/", "models/", "process/pool.py"],
     "plyfile": ["formats/ply.py"],
     "pycolmap": ["scenes/"],
-    "pydantic": ["config.py", "recipes.py", "adaptation/curve.py", "adaptation/report.py", "jobs/finished.py"],
+    "pydantic": ["config.py", "adaptation/curve.py", "adaptation/report.py", "jobs/finished.py"],
     "pytest": ["backends/conformance/suite.py", "models/conformance.py"],
     "safetensors": ["adaptation/target/super_resolution.py"],
     "skimage": ["evaluation/metrics.py"],

@@ -194,23 +194,17 @@ def render_model(
 
     `clamped`: whether each of several samples of a pixel is clamped before their mean is taken.
     """
-    with threads.limited_for(backend, None):
-        return _rendered(model, backend, camera, effects, form, clamped)
-
-
-def _rendered(
-    model: SplatModel, backend: Backend, camera: Camera, effects: Effects, form: Callable[[Gaussians], Gaussians] | None, clamped: bool
-) -> Rendered:
     matrix = model.traits.exposures.of(camera) if effects.exposure else None
     family = f"family {model.family!r}"
-    with naming_any({family: model}), unchanged(family, tensors_of(model)), large_for_torch(model.parameters()["means"]):
-        gaussians = contract.checked_splats(model, supersample.of_samples(camera, effects.supersampling))
-    gaussians = gaussians if form is None else form(gaussians)
-    rendered = supersample.render(backend, gaussians, camera, effects, clamped=clamped)
-    if effects.outputs:
-        from mipmap_plugin.backends import geometry  # an effect that is off is not imported
+    with threads.limited_for(backend, None):
+        with naming_any({family: model}), unchanged(family, tensors_of(model)), large_for_torch(model.parameters()["means"]):
+            gaussians = contract.checked_splats(model, supersample.of_samples(camera, effects.supersampling))
+        gaussians = gaussians if form is None else form(gaussians)
+        rendered = supersample.render(backend, gaussians, camera, effects, clamped=clamped)
+        if effects.outputs:
+            from mipmap_plugin.backends import geometry  # an effect that is off is not imported
 
-        rendered = geometry.with_outputs(rendered, backend, gaussians, camera, effects)
+            rendered = geometry.with_outputs(rendered, backend, gaussians, camera, effects)
     if matrix is not None:
         rendered = rendered.replaced(image=exposed(rendered.image, matrix))
     return rendered.replaced(effects=tuple(explain(effects, gaussians, effects_of(model))))

@@ -43,7 +43,7 @@ SHARE = 0.5
 def conversion(config: AdaptConfig, base: Effects, targets: Collection[Effects], scale: float) -> AdaptConfig | None:
     """The settings of the conversion before a zoom-in with `config`; None where there is none. `base`: how the base is rendered.
 
-    It looks from where the zoom-in does, whose views for validation are not adapted to in either.
+    It has the views of the zoom-in, and those that are kept for validation are adapted to in neither stage.
     A file for several viewers has none: at x1, where their filters differ most, it would learn a compromise that a zoom-in does not need.
     """
     steps = min(config.conversion_steps, config.steps)

@@ -22,8 +22,8 @@ LOOKED_AT, SAMPLES, DISPLACED = 4, 1 << 14, 0.5
 
 @dataclass(frozen=True, eq=False)
 class NearPlanes:
-    """Whether renderers that differ in the near plane alone, as INRIA's and gsplat's do, draw a base alike. Each answer is kept: all splats are
-    looked at from all views."""
+    """Whether renderers that differ in the near plane alone, as INRIA's and gsplat's do, draw a base alike. Each answer is kept, since all views have
+    to look at all splats for it."""
 
     base: SplatModel
     trained: Effects  # how the base is rendered

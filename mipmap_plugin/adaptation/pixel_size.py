@@ -32,7 +32,7 @@ def enough_views(means: Tensor, views: Sequence[Camera]) -> int:
     """How many views, evenly spread over `views`, show enough of the splats at `means` [N, 3]."""
     some, points = every_nth(views, LEAST_VIEWS), means[:: max(1, len(means) // COUNTED)]
     shares = [view.in_picture(view.to_camera(points)).float().mean(1) for view in in_batches(some, points)]
-    return views_for(float(torch.cat(shares).mean()) if some else 0.0)
+    return views_for(float(torch.cat(shares).mean()))
 
 
 def views_for(share: float) -> int:

@@ -56,7 +56,7 @@ class Viewpoints:
     orbit: Orbit
     clear: Callable[[Sequence[Camera]], list[Camera]]  # those of the views that see it clearly (`ClearViews`)
     looks: float = math.inf  # so many views may be looked at (`amount.looks_in_budget`)
-    finer: bool = True  # whether a fifth of the views are finer (`Orbit.finer`): not of those that stand for the training's
+    finer: bool = True  # whether a fifth of the views are finer (`Orbit.finer`); False for views that take the place of the training's
 
     def views(self, size: tuple[int, int], count: int, generator: torch.Generator) -> list[Camera]:
         """`count` views of `size` (height, width) px. Of a capture they are clear: fewer where fewer are, and any, with a warning, where none is."""
@@ -98,7 +98,7 @@ class ClearViews:
     def __init__(self, model: SplatModel, backend: Callable[[], tuple[Backend, str]], effects: Effects) -> None:
         """`effects`: how the model is rendered at its own scale.
 
-        `backend`: chooses what draws the model (`choose_backend`); a reference to the base, which has this, would keep its memory.
+        `backend`: chooses what draws the model (`choose_backend`). Not a method of the base: that would keep the base in memory.
         """
         self._model, self._backend, self._effects = model, backend, colorless(effects)
         self._known: dict[Hashable, bool] = {}  # by `facts`

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from mipmap_plugin.backends.reference import finite_rows
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.splatting.rotations import unit
 
 NO_CUDA = "it needs a CUDA GPU, and torch sees none here"
 
@@ -24,9 +22,3 @@ def finite_splats(gaussians: Gaussians) -> Gaussians:
     """The splats whose every number is finite; a single NaN can spread over an image. Synchronizes with the GPU."""
     finite = finite_rows(gaussians)
     return gaussians if bool(finite.all()) else gaussians[finite]
-
-
-def normalized(quats: Tensor) -> Tensor:
-    """`quats` [N, 4] of norm 1, the identity where one is zero. Other rasterizers divide by the norm, which may underflow float32."""
-    units = unit(quats)
-    return torch.where((units == 0).all(1, keepdim=True), units.new_tensor([1.0, 0.0, 0.0, 0.0]), units)

@@ -27,12 +27,13 @@ from typing import Any
 import torch
 
 from mipmap_plugin.backends.base import API_VERSION, CachedCheck, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.external import NO_CUDA, at_the_origin, finite_splats, normalized
+from mipmap_plugin.backends.external import NO_CUDA, at_the_origin, finite_splats
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable, brief, install
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.rotations import unit_quaternions
 
 NO_GSPLAT = f"it needs gsplat; {install('gsplat')}"
 CUDA_PART = "gsplat.cuda._backend"
@@ -102,7 +103,7 @@ def arguments(gaussians: Gaussians, camera: Camera, effects: Effects) -> dict[st
     means = gaussians.means
     return {
         "means": means - camera.center.to(means),
-        "quats": normalized(gaussians.quats),
+        "quats": unit_quaternions(gaussians.quats),  # the norm, by which gsplat divides, may underflow float32
         "scales": gaussians.scales,
         "covars": gaussians.covariances,
         "opacities": gaussians.opacities,

@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.backends.base import API_VERSION, CachedCheck, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.external import NO_CUDA, at_the_origin, finite_splats, normalized
+from mipmap_plugin.backends.external import NO_CUDA, at_the_origin, finite_splats
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -36,6 +36,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.screen_filters import DILATION
 from mipmap_plugin.splatting.filters import footprint
 from mipmap_plugin.splatting.projection import covariances_of, project
+from mipmap_plugin.splatting.rotations import unit_quaternions
 
 PACKAGE = "diff_gaussian_rasterization"
 NO_PACKAGE = f"it needs {PACKAGE}, which is built from INRIA's sources (for non-commercial use)"
@@ -143,9 +144,8 @@ def splats_of(gaussians: Gaussians) -> dict[str, Tensor]:
     """The rasterizer's arguments for splats, except colors."""
     shape: dict[str, Tensor]
     if gaussians.covariances is None:
-        quats = normalized(gaussians.quats)
-        units = quats / quats.norm(dim=1, keepdim=True)
-        shape = {"scales": gaussians.scales.contiguous(), "rotations": units.contiguous()}  # its backward pass reads them as they lie in memory
+        rotations = unit_quaternions(gaussians.quats).contiguous()
+        shape = {"scales": gaussians.scales.contiguous(), "rotations": rotations}  # its backward pass reads them as they lie in memory
     else:
         shape = {"cov3D_precomp": gaussians.covariances.flatten(1)[:, [0, 1, 2, 4, 5, 8]]}
     means = gaussians.means

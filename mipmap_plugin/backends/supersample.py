@@ -22,9 +22,8 @@ def render(backend: Backend, gaussians: Gaussians, camera: Camera, effects: Effe
     fine = camera.resized(camera.width * n, camera.height * n)
     finer = replace(effects, supersampling=1, eps2d=effects.eps2d * n**2, settings=effects.settings.finer(n))
     rendered = backend.render(gaussians, fine, finer)
-    image = rendered.image.clamp(0, 1) if clamped else rendered.image
-    blocks = image.unflatten(1, (-1, n)).unflatten(0, (-1, n))
-    return Rendered(blocks.mean(dim=(1, 3)), rendered.alpha.unflatten(1, (-1, n)).unflatten(0, (-1, n)).mean(dim=(1, 3)))
+    samples = (rendered.image.clamp(0, 1) if clamped else rendered.image), rendered.alpha
+    return Rendered(*(each.unflatten(1, (-1, n)).unflatten(0, (-1, n)).mean(dim=(1, 3)) for each in samples))
 
 
 def of_samples(camera: Camera, n: int) -> Camera:

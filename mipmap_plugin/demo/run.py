@@ -28,7 +28,7 @@ from mipmap_plugin.progress import announced
 from mipmap_plugin.scenes import read_cameras
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
-PROTOCOL = Protocol("demo", "box", truncate=False)
+PROTOCOL = Protocol("demo", "box")
 
 # Number of views to evaluate on, and the fraction of each side that is evaluated at zoom-in, since the truth has to be ray-traced.
 JUDGED, MIDDLE = 3, 1 / 3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from itertools import product
 from statistics import fmean
 from typing import Any
@@ -89,12 +89,9 @@ class Evaluator:
         recorder.replay(known, self.views[0].camera)
         return Row(**known["row"])
 
+    @threads.limited(None, shared=True)  # small images take many times as long on torch's threads where the machine is busy
     def row(self, name: str, scale: float, show: RenderView, **facts: Any) -> Row:
         """The mean quality of `show(camera at the base scale)` over the views. PSNRs of views are averaged, as in the literature."""
-        with threads.limited(None, shared=True):  # small images take many times as long on torch's threads where the machine is busy
-            return self._row(name, scale, show, facts)
-
-    def _row(self, name: str, scale: float, show: RenderView, facts: dict[str, Any]) -> Row:
         psnrs, similarities, distances = [], [], []
         watch = warm_stopwatch(show, self.views[0].camera)
         for view in Bar(self.views, desc=f"{name} x{scale:g}", leave=False):
@@ -202,13 +199,10 @@ def config_of(name: str, scale: float, settings: dict[str, Any]) -> AdaptConfig:
 
 def _adapted_rows(model: Wrapped, judge: Evaluator, scale: float, recipes: Sequence[str], settings: dict[str, Any]) -> list[Row]:
     """The rows of each recipe, adapted to the training poses and to the evaluated ones."""
-    warm = False
+    warm = cache(partial(warm_up, model, scale, model.cameras))
 
     def row(name: str, on: str, judge: Evaluator) -> Row:
-        nonlocal warm
-        if not warm:
-            warm_up(model, scale, model.cameras)
-            warm = True
+        warm()  # before the first that is measured
         own = settings | _views(make_config(name, scale), on, judge.views)
         if most_steps(name, scale, own.get("steps")) is None:
             own.pop("steps", None)

@@ -19,7 +19,7 @@ from mipmap_plugin.models import contract, detect, load_model
 from mipmap_plugin.models.adapted_name import adapted_name
 from mipmap_plugin.models.base import Filtered, SplatModel, Thinned, why_no_viewer
 from mipmap_plugin.models.vanilla import VanillaModel
-from mipmap_plugin.scenes.orbits import orbit
+from mipmap_plugin.scenes.orbits import Orbit
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
 # Allowed difference of images, because formats round.
@@ -55,7 +55,7 @@ class ModelSuite:
     @pytest.fixture
     def base(self, checkpoint: Path) -> Wrapped:
         model = load_model(checkpoint)
-        views = self.cameras or orbit(model.parameters()["means"], (24, 32), 4, torch.Generator().manual_seed(0))
+        views = self.cameras or Orbit.around(model.parameters()["means"]).views((24, 32), 4, torch.Generator().manual_seed(0))
         return wrap_model(model, cameras=views, backend="reference")
 
     def test_is_recognized(self, checkpoint: Path) -> None:

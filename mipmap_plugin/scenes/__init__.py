@@ -18,7 +18,6 @@ from mipmap_plugin.scenes.colmap import is_colmap, read_colmap
 from mipmap_plugin.scenes.dynerf import is_dynerf, read_dynerf
 from mipmap_plugin.scenes.hypernerf import is_hypernerf, read_hypernerf
 from mipmap_plugin.scenes.in_ply import cameras_in
-from mipmap_plugin.scenes.orbits import orbit
 from mipmap_plugin.scenes.training_options import DEFORMABLE, UNBENT, photographs_folder, unbent_by
 from mipmap_plugin.scenes.trajectories import jittered
 from mipmap_plugin.scenes.transforms import read_transforms
@@ -33,7 +32,7 @@ COLMAP_FILES = {f"{name}{suffix}" for name in ("cameras", "images", "points3D", 
 RAW = {"keyframes/*cameras": "Polycam", "rgbd/0.*": "Record3D", "depth/0.exr": "Record3D"}
 
 __all__ = [
-    "DEFORMABLE", "Scene", "cameras_in", "jittered", "load_photographs", "load_scene", "model_cameras", "orbit", "read_cameras", "read_colmap",
+    "DEFORMABLE", "Scene", "cameras_in", "jittered", "load_photographs", "load_scene", "model_cameras", "read_cameras", "read_colmap",
     "read_transforms", "unread_cameras", "write_cameras",
 ]  # fmt: skip
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -76,8 +75,8 @@ class Orbit:
     focal: float = 0.0
 
     @classmethod
-    def around(cls, means: Tensor, up: Sequence[float] | None = None, sharp: Callable[[], float] = lambda: math.inf) -> Orbit:
-        """Around `means` [N, 3], from a distance that frames them as `frame` says. `up` defaults to `guess_up`.
+    def around(cls, means: Tensor, sharp: Callable[[], float] = lambda: math.inf) -> Orbit:
+        """Around `means` [N, 3], from a distance that frames them as `frame` says, with the vertical of `guess_up`.
 
         `sharp`: the size of sharp splats (`sharp_size`), of which a capture is seen from so near that they are about as large as pixels. Raises
         SettingsError without splats.
@@ -91,8 +90,7 @@ class Orbit:
             outside = max(quantile((means - center).norm(dim=1), MIDDLE).item(), 2 * NEAR_PLANE)
             distance, nearest = (min(distance, max(far, outside)) for far in (from_here, NEARER * from_here))
         x, y, z = center.tolist()
-        vertical = guess_up(means) if up is None else (up[0], up[1], up[2])
-        return cls((x, y, z), vertical, distance, nearest=nearest)
+        return cls((x, y, z), guess_up(means), distance, nearest=nearest)
 
     def where_photographed(self, splats: Gaussians) -> Orbit:
         """The orbit from where the colors of the splats tell that a capture was photographed; the same if they do not tell, and around an object.
@@ -151,18 +149,6 @@ class Orbit:
         guessed = self.up is not None and not self.said
         elevations = HANDHELD if guessed else ABOVE if self.said else ALL
         return (_sky_directions if guessed else _spiral)(vertical, elevations, count, generator)
-
-
-def orbit(
-    means: Tensor | Gaussians, size: tuple[int, int], count: int, generator: torch.Generator, up: Sequence[float] | None = None
-) -> list[Camera]:
-    """`count` views of `size` (height, width) px around the scene, for a checkpoint without cameras (`Orbit`).
-
-    Suitable for objects: the positions of the cameras of an unbounded scene do not follow from its splats. Raises SettingsError
-    without splats or views.
-    """
-    around = Orbit.around(means.means, up, partial(sharp_size, means)) if isinstance(means, Gaussians) else Orbit.around(means, up)
-    return around.views(size, count, generator)
 
 
 def frame(means: Tensor) -> tuple[Tensor, float, bool]:

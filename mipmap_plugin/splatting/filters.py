@@ -88,9 +88,8 @@ def footprint(
     "analytic" dilates and integrates over each pixel, "window" over the part of the pixel that is still visible.
     `max_variance` px²: `settings.max_variance` for the size of the image.
     """
-    xx, yy = projected.xx + eps2d, projected.yy + eps2d
-    det = projected.det + eps2d * (projected.xx + projected.yy) + eps2d**2  # = xx·yy - xy² without its cancellation
-    shape = xx, projected.xy, yy, det
+    det = projected.dilated_det(eps2d)
+    shape = projected.xx + eps2d, projected.xy, projected.yy + eps2d, det
     if screen_filter in INTEGRALS:
         return integral_of(INTEGRALS[screen_filter], shape, opacities)
     gate = culls.gate(shape, opacities, settings) if settings.culls else None

@@ -29,6 +29,10 @@ class Projected:
     det: Tensor  # [N] px⁴, never negative
     to_image: Tensor | None = None  # [N, 2, 3] px per world unit: the derivative of the projection at each center, where `project` computed it
 
+    def dilated_det(self, eps2d: float) -> Tensor:
+        """[N] px⁴: the determinant of the covariance plus `eps2d` px² along x and y, as xx·yy - xy² without its cancellation."""
+        return self.det + eps2d * (self.xx + self.yy) + eps2d**2
+
     def with_axes(self, axes: Tensor) -> Projected:
         """What `project` returns for splats at the same places with other `axes` [N, 3, 3] (`axes_of`)."""
         assert self.to_image is not None

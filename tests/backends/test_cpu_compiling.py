@@ -19,6 +19,12 @@ from mipmap_plugin.backends.cpu_kernels import binning, compiling
 from mipmap_plugin.backends.cpu_kernels.memory import scratch
 
 
+@pytest.fixture(autouse=True)
+def cache(monkeypatch, tmp_path):
+    """An empty folder for compiled code: what an earlier run of the tests has left would be loaded and not compiled."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+
+
 @pytest.fixture
 def emitted(monkeypatch):
     """The text of all LLVM modules, before LLVM sees them."""
@@ -73,27 +79,21 @@ def is_defined(result) -> bool:
     return result.target_context.codegen()._engine.is_symbol_defined(result.fndesc.mangled_name)
 
 
-@pytest.fixture
-def cached(monkeypatch, tmp_path):
-    """A function that makes a kernel anew, as another process would, with a cache of its own on disk, and calls it."""
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
-
-    def called():
-        kernel = compiling.kernel(binning.tile_grid.py_func)
-        assert kernel(65, 16) == (2, 1)
-        return kernel.stats
-
-    return called
+def called():
+    """The statistics of a kernel that is made anew, as another process would, and called."""
+    kernel = compiling.kernel(binning.tile_grid.py_func)
+    assert kernel(65, 16) == (2, 1)
+    return kernel.stats
 
 
-def test_a_kernel_is_compiled_once_for_all_processes(cached):
-    assert [sum(cached().cache_hits.values()) for _ in range(2)] == [0, 1]
+def test_a_kernel_is_compiled_once_for_all_processes():
+    assert [sum(called().cache_hits.values()) for _ in range(2)] == [0, 1]
 
 
-def test_a_kernel_is_compiled_anew_when_any_source_has_changed(cached, monkeypatch):
-    cached()
+def test_a_kernel_is_compiled_anew_when_any_source_has_changed(monkeypatch):
+    called()
     monkeypatch.setattr(compiling, "sources", lambda: "others")
-    assert [sum(cached().cache_hits.values()) for _ in range(2)] == [0, 1]
+    assert [sum(called().cache_hits.values()) for _ in range(2)] == [0, 1]
 
 
 def test_the_sources_are_all_that_kernels_are_made_of():

@@ -20,7 +20,7 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.splatting.projection import covariances_of
-from mipmap_plugin.splatting.rotations import unit
+from mipmap_plugin.splatting.rotations import unit_quaternions
 
 gsplat = pytest.importorskip("gsplat", reason="gsplat is in the test extra")
 
@@ -64,7 +64,7 @@ def test_the_arguments_are_those_of_gsplat(stand_in):
     assert args["backgrounds"].tolist() == [[pytest.approx(0.2), 0.5, pytest.approx(0.9)]]
     assert (args["packed"], args["covars"], args["render_mode"]) == (False, None, "RGB")
     assert 0.25 < args["near_plane"] < 0.25 + 1e-7
-    assert torch.equal(args["colors"], splats.sh) and torch.equal(args["quats"], unit(splats.quats))
+    assert torch.equal(args["colors"], splats.sh) and torch.equal(args["quats"], unit_quaternions(splats.quats))
 
 
 def test_the_eye_becomes_the_origin(stand_in):

@@ -83,6 +83,15 @@ def test_colors_below_0_are_named(monkeypatch):
     assert "does not clamp colors" in usual_fault(Unclamped())
 
 
+@pytest.mark.parametrize("degree", [0, 1])
+def test_a_backend_of_float32_and_few_bands_is_judged_by_these(degree):
+    class Young(Wrong):
+        def lacking(self, needs):
+            return Capabilities(None, frozenset({torch.float32}), frozenset({"classic"}), max_sh_degree=degree).lacking(needs)
+
+    assert usual_fault(Young()) == "" and "whole numbers" in usual_fault(Young(partial(shifted, 0.5)))
+
+
 def test_a_backend_that_has_none_of_the_filters_is_not_judged():
     class Narrow(ReferenceBackend):
         def lacking(self, needs):

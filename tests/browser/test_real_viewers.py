@@ -151,7 +151,7 @@ def test_a_real_base_looks_as_we_say(browser: Browser, shared_data: Path, viewer
 @pytest.mark.parametrize("viewer", VIEWERS)
 def test_a_real_capture_looks_as_we_say(browser: Browser, shared_data: Path, viewer: str) -> None:
     capture = wrap_model(shared_data / "checkpoints" / "yashica-t4" / "yashica-t4-top8192.ply", background=WHITE)
-    around = Orbit.around(capture.model.parameters()["means"], up=(0.0, 0.0, 1.0))
+    around = replace(Orbit.around(capture.model.parameters()["means"]), up=(0.0, 0.0, 1.0))
     cameras = [camera.resized(160, 120) for camera in around.views((800, 800), 100, torch.Generator().manual_seed(0))[:2]]
     assert likeness(browser, viewer, capture, cameras) > SURROUNDED.get(viewer, ALIKE)
 

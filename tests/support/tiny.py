@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from orbiting import orbit
 
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
@@ -14,7 +15,7 @@ from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
-from mipmap_plugin.scenes import orbit, write_cameras
+from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
 WIDTH, HEIGHT = 32, 24  # px

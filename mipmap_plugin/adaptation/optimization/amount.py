@@ -19,8 +19,8 @@ VIEWS, SPLATS = 12, 1 << 16
 # At least this fraction of the steps is taken: it costs 1 to 3 dB of what all of them reach (docs/recipes_found.md), and fewer were not tried.
 LEAST_FRACTION = 1 / 4
 
-# Splats drawn in a second of a time budget, as many as the most of `default` in its minute on two cores. Moments of a moving scene do not follow
-# from the clock, so that a run can be resumed.
+# Splats that a second of a time budget is taken to draw: those of `default` at most (`recipes.MOST_DRAWS`) over its minute on two cores. The moments
+# of a moving scene follow from this and not from the clock, so that a run can be resumed.
 DRAWS_A_SECOND = 3e6
 
 # The fraction of a run's draws that may be spent on moments, the number of times that each moment is evaluated, and the least number of moments.
@@ -124,9 +124,9 @@ def _fewer(config: AdaptConfig, fraction: float) -> AdaptConfig:
 
 
 def as_taken(config: AdaptConfig, taken: AdaptConfig) -> AdaptConfig:
-    """What `affordable` makes of the settings for the scene of which it made `taken`, if of the same settings.
+    """What `affordable` makes of these settings for the scene for which it made `taken`, of these or of others.
 
-    The fraction is known by the steps, which are rounded up, and so the extra views up to one or a few.
+    Which fraction of the steps that was is known from `taken`. Steps are rounded up, so that the number of extra views is known to one or a few.
     """
     if config.most_draws is None or not LEAST_FRACTION * config.steps <= taken.steps < config.steps:
         return config

@@ -1,7 +1,7 @@
 """Algorithm 1 of Mipmap-GS: optimize the splats against the images of the frozen base, resized to the new scale.
 
 `adapt` repeats: choose views, make r(x̂) of those that have none yet, take a step, and check the splats on other views. A step draws x, compares it
-with r(x̂), goes backward and moves the splats; every some steps it prunes and densifies.
+with r(x̂), goes backward and moves the splats; every so many steps it prunes and densifies.
 """
 
 from __future__ import annotations

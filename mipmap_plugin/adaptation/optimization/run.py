@@ -67,10 +67,6 @@ class Task:
         """The number of splats that the first view shows at the new scale."""
         return count_of(model, self.views[0], self.scale)
 
-    def pixel(self, model: SplatModel) -> float:
-        """The size of a pixel in world units, by which the means move."""
-        return target_pixel(model, self.views, self.scale)
-
     @torch.no_grad()
     def agreement(self, student: SplatModel, config: AdaptConfig) -> float:
         """PSNR (dB) of the student against the truth over some of the views."""
@@ -117,7 +113,7 @@ class Run:
     def start(cls, student: SplatModel, task: Task, config: AdaptConfig, spent: float = 0.0) -> Run:
         """A run before its first step; `spent`: the seconds used so far."""
         means = student.parameters()["means"]
-        optimizer, watch = make_optimizer(student, config, task.pixel(student)), Stopwatch(seconds=spent)
+        optimizer, watch = make_optimizer(student, config, target_pixel(student, task.views, task.scale)), Stopwatch(seconds=spent)
         with watch:
             trial = Trial(task.agreement(student, config)) if config.densify_on_trial and config.densify_gradient is not None else None
             costs = Costs(motion=lambda: task.follow.seconds, device=means.device)

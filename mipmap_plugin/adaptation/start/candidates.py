@@ -34,14 +34,14 @@ LEAST_DB = 25.0
 # dB by which such a result may be worse than the base itself: steps regain 3 to 8 dB.
 COARSE_COSTS = 3.0
 
-# In a time budget that is too short for a search, a run begins with the strongest merging if that is to leave at most FAR_FEWER of the splats, which
-# makes steps much faster, and really leaves at most REACHED times as many as it is to. Lego and chair keep up to 1.3 times as many, and gain 0.6 to
-# 5 dB by it; two captures and three other scenes keep 2.1 times as many and more, and the captures' starts would lose 0.7 to 2 dB.
+# In a time budget that is too short for a search, a run begins with the strongest merging, which makes steps much faster: if the settings ask for at
+# most FAR_FEWER of the splats, and no more than REACHED times as many are left. Lego and chair keep up to 1.3 times as many, and gain 0.6 to 5 dB by
+# it; two captures and three other scenes keep 2.1 times as many and more, and the captures' starts would lose 0.7 to 2 dB.
 FAR_FEWER, REACHED = 1 / 4, 1.5
 
-# Where more than this part of the splats become too faint to be drawn, opacities are also matched in one sweep, or in none, where they are told by
-# this power of areas: what is not drawn has no weight, and is raised until all together hide several times too much. Four objects gain 0 to 4 dB
-# by it at x1/16, 1 to 8 at x1/32 and 5 to 11 at x1/64, two captures nothing.
+# Where more than this part of the splats become too faint to be drawn, one sweep of matching, or none, and this power of areas are tried too.
+# What is not drawn has no weight, so that matching raises it, until all of it together hides several times too much. Four objects gain 0 to 4 dB by
+# it at x1/16, 1 to 8 at x1/32 and 5 to 11 at x1/64, two captures nothing.
 FAINT, FEWER = 0.1, (((1,), AREA_POWER), ((), 1.0), ((), AREA_POWER))
 
 # dB by which further sweeps may look worse: on other views than those that choose, eight starts of objects and captures were 0 to 0.5 dB better.
@@ -61,7 +61,7 @@ def start_name(forms: bool, *, merged: bool = False, thinned: bool = False) -> s
 
 @torch.no_grad()
 def best_start(problems: Sequence[StartProblem]) -> tuple[SplatModel, str, list[str]]:
-    """The best start, what it is called in the report, and what is to be said of it. `problems`: of two, one is without the conversion.
+    """The best start, what it is called in the report, and what is to be said of it. `problems`: one, or two, of which one begins with a conversion.
 
     At x1 a viewer's filter may be wider than the base's, which takes from thin splats what a zoom-in, where that filter is narrower, needs.
     In a time budget the second one is tried if there is time for another start like the first.

@@ -141,7 +141,7 @@ class _Change:
 
         def areas(_: CameraTensors, projected: Projected) -> Tensor:
             new_projected = projected.with_axes(axes[1]) if new.covariances is None else projected
-            return torch.stack([_det(projected, variances[0]), _det(new_projected, variances[1])]).sqrt()
+            return torch.stack([projected.dilated_det(variances[0]), new_projected.dilated_det(variances[1])]).sqrt()
 
         near, plain = self.base.near_plane, old.covariances is None
         known = summed_areas(old.means, zip(axes, variances, strict=True), self.zoomed, near) if plain else None
@@ -236,8 +236,3 @@ def _mean_in_front(gaussians: Gaussians, views: Sequence[Camera], near: float, q
         in_front = projected.depths > near
         total, count = total + torch.where(in_front, quantity(view, projected), 0.0).sum(-2), count + in_front.sum(0)
     return torch.where(count > 0, total / count.clamp_min(1), 1.0)
-
-
-def _det(projected: Projected, eps2d: float) -> Tensor:
-    """[N] px⁴: the determinant of the projected covariance plus a filter of `eps2d` px²."""
-    return projected.det + eps2d * (projected.xx + projected.yy) + eps2d**2

@@ -17,8 +17,8 @@ POWERS = (1, 1 / 2, 1 / 4)
 # would keep half of them at x0.57.
 COARSE_POWERS = (1, 7 / 8, 3 / 4, 5 / 8, 1 / 2)
 
-# The powers that are tried after those where no step follows and merging gains, as of dots too small for the viewer to draw: even where too few share
-# a pixel. At x0.57 in PlayCanvas a lattice of dots gains 0.6 dB by the first.
+# The powers that are tried next if no step follows and merging gains, as with dots that are too small for the viewer to draw: then splats are merged
+# even where too few share a pixel. At x0.57 in PlayCanvas a lattice of dots gains 0.6 dB by the first.
 FURTHER_POWERS = (1 / 2, 3 / 4, 1)
 
 # dB that the mildest merging may cost before steps for a renderer that draws otherwise than the training did, even if the settings allow less: fewer

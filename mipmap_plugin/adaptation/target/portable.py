@@ -30,10 +30,11 @@ def settings_for_several(config: AdaptConfig) -> dict[str, Any]:
 
 
 def extreme_targets(targets: Mapping[str, Effects]) -> dict[str, Effects]:
-    """The viewers among `targets` that are extreme in one respect, of equals the first: the widest dilation with compensation, of these the one
-    that limits colors most, and without; the narrowest dilation; and those that leave out most splats or change them most for their size.
+    """The viewers among `targets` that are extreme in one respect; of equals the first.
 
-    Of those with compensation that is Spark, which also sorts by distance, and not gsplat's antialiased mode (docs/recipes_found.md).
+    These are: the widest dilation without compensation; the widest with it and, of equally wide ones, the lowest limit of colors; the narrowest
+    dilation; and what leaves out most splats, or stretches them most, for their size. With compensation that is Spark, which also sorts by
+    distance, and not gsplat's antialiased mode (docs/recipes_found.md).
     """
     respects: tuple[Callable[[Effects], tuple[float, ...]], ...] = (
         lambda effects: (0.0 if _compensates(effects) else effects.eps2d,),

@@ -79,13 +79,13 @@ def check_case(backend: Backend, name: str, build: Builder, *, dtype: torch.dtyp
 def fitted(backend: Backend, build: Builder, *, dtype: torch.dtype, device: str) -> tuple[HardCase, list[str]]:
     """A case as the backend is to draw it, and the reasons why it cannot."""
     case = build()
-    case = case._replace(gaussians=case.gaussians.to(device, dtype))
-    case = case if case.about_degree else lowered(backend, case)
+    case = case._replace(gaussians=case.gaussians.to(device, dtype)) if case.about_degree else lowered(backend, case, dtype=dtype, device=device)
     return case, backend.lacking(Needs.of(case.gaussians, case.effects, gradients=False))
 
 
-def lowered(backend: Backend, case: HardCase) -> HardCase:
-    """The case with its colors evaluated to the highest degree that the backend has; as it is if the backend lacks something else."""
+def lowered(backend: Backend, case: HardCase, *, dtype: torch.dtype, device: str) -> HardCase:
+    """The case on `device` in `dtype`, its colors evaluated to the highest degree that the backend has, or to all if it lacks something else."""
+    case = case._replace(gaussians=case.gaussians.to(device, dtype))
     for degree in range(case.effects.sh_degree, -1, -1):
         lower = case._replace(effects=replace(case.effects, sh_degree=degree))
         if not backend.lacking(Needs.of(lower.gaussians, lower.effects, gradients=False)):
@@ -101,8 +101,7 @@ def summary(outcomes: Sequence[Outcome]) -> str:
 
 def check_views(backend: Backend, build: Builder, *, dtype: torch.dtype = torch.float32, device: str = "cpu") -> Outcome:
     """Check that `render_views`, which few backends have, draws a case and another view of it as `render` does, and sums their gradients."""
-    case = build()
-    case = lowered(backend, case._replace(gaussians=case.gaussians.to(device, dtype)))
+    case = lowered(backend, build(), dtype=dtype, device=device)
     splats = case.gaussians
     shots = [(case.camera, case.effects), (case.camera.zoomed(0.5), case.effects)]
     answers = []
@@ -120,8 +119,7 @@ def check_views(backend: Backend, build: Builder, *, dtype: torch.dtype = torch.
 
 def check_steps(backend: Backend, build: Builder, *, dtype: torch.dtype = torch.float32, device: str = "cpu") -> Outcome:
     """Check that a `stepper`, which few backends have, draws a case as `render` does, and hands the right gradients to Adam."""
-    case = build()
-    case = lowered(backend, case._replace(gaussians=case.gaussians.to(device, dtype)))
+    case = lowered(backend, build(), dtype=dtype, device=device)
     g = case.gaussians
     raw = {"means": g.means, "quats": 2 * g.quats, "scales": g.scales.log(), "opacities": g.opacities.logit(), "sh": g.sh}
     actual, expected = _step_answer(backend, raw, case), _raw_answer(backend, raw, case)

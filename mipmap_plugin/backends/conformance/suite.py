@@ -54,8 +54,7 @@ class BackendSuite:
 
     def test_leaves_its_input_as_it_is(self) -> None:
         """The splats may be the base's own tensors."""
-        case = CASES["sh-degree-3"]()
-        case = lowered(self.backend, case._replace(gaussians=case.gaussians.to(self.device, self.dtype)))
+        case = lowered(self.backend, CASES["sh-degree-3"](), dtype=self.dtype, device=self.device)
         splats = case.gaussians
         copies = {name: tensor.clone() for name, tensor in splats.tensors().items()}
         with torch.no_grad():

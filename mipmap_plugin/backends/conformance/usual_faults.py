@@ -31,13 +31,14 @@ ALONG = 1e-3
 def usual_fault(backend: Backend, *, dtype: torch.dtype = torch.float32, device: str = "cpu") -> str:
     """What seems to be wrong with a backend's image of ordinary splats, or else with its gradients; "" if nothing is, or nothing usual."""
     for screen_filter in FILTERS:
-        exact = lowered(backend, random_scene(1, screen_filter, EPS2D))
-        case = exact._replace(gaussians=exact.gaussians.to(device, dtype))
+        exact = random_scene(1, screen_filter, EPS2D)
+        case = lowered(backend, exact, dtype=dtype, device=device)
         if not backend.lacking(Needs.of(case.gaussians, case.effects, gradients=False)):
             break
     else:
         return ""
     differentiate = not backend.lacking(Needs.of(case.gaussians, case.effects, gradients=True))
+    exact = exact._replace(effects=case.effects)
     actual, expected = draw(backend, case, differentiate=differentiate), draw(ReferenceBackend(), exact)
     tolerance = tolerance_for(dtype)
     if not differing_images("image", actual.image, expected.image, tolerance):

@@ -39,7 +39,7 @@ class GroundTruth:
     adapt_on: list[Camera]  # the other cameras, to adapt to; none: an orbit is generated
     psnr: Callable[[Camera, Tensor], float]  # (one of the views, the image of it at the new scale) -> dB
     shrink_by: str  # the filter that made the truth smaller
-    itself: tuple[str, ...] = ()  # the baselines that the truth is, and that are no rivals to it
+    itself: tuple[str, ...] = ()  # the baselines that are the truth itself, and so no rivals
 
 
 def photographs(model: Wrapped, scene: Scene, scale: float, most: int | None) -> GroundTruth:

@@ -5,11 +5,11 @@ from statistics import fmean
 import pytest
 import tiny
 import torch
+from orbiting import orbit
 
 from mipmap_plugin.adaptation.target.resize import fitting, resize
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.scenes import orbit
 from mipmap_plugin.wrap import wrap_model
 
 FITTING = AdaptConfig(resize="fitting")

@@ -7,11 +7,12 @@ from itertools import pairwise
 import pytest
 import torch
 from largest import Largest
+from orbiting import orbit
 
 from mipmap_plugin.camera import Camera, viewmat_of
 from mipmap_plugin.effects import NEAR_PLANE
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.scenes import jittered, load_scene, orbit
+from mipmap_plugin.scenes import jittered, load_scene
 from mipmap_plugin.scenes.orbits import TIGHT, Orbit, frame, guess_up
 from mipmap_plugin.scenes.trajectories import BEYOND, CANDIDATES, rotation_matrix, rotation_vector
 
