@@ -49,6 +49,7 @@ VIEWERS: dict[str, tuple[str, dict[str, Any]]] = {
     "playcanvas": ("playcanvas", {}),
     "playcanvas-webgpu": ("playcanvas", {"device": "webgpu"}),
     "playcanvas-aa": ("playcanvas", {"antiAlias": True}),
+    "supersplat-viewer": ("supersplat-viewer", {}),
     "gaussian-splats-3d": ("gaussian-splats-3d", {}),
     "babylon": ("babylon", {}),
     "gsplat-js": ("gsplat", {}),
