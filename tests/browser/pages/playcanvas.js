@@ -79,17 +79,19 @@ export async function start({ device: type = 'webgl2', ...settings }) {
       return target ? readTexture(target) : readPixels(device.gl, view)
     },
 
-    // How many splats of each level the last picture has, of a streamed file.
-    levels() {
-      const counts = []
-      for (const { octree, nodeInfos } of octrees(app, eye)) {
-        nodeInfos.forEach(({ currentLod }, i) => {
-          if (currentLod >= 0) counts[currentLod] = (counts[currentLod] ?? 0) + octree.nodes[i].lods[currentLod].count
-        })
-      }
-      return Array.from(counts, (count) => count ?? 0)
-    },
+    levels: () => levelsOf(app, eye),
   }
+}
+
+// How many splats of each level the last picture has, of a streamed file.
+export function levelsOf(app, eye) {
+  const counts = []
+  for (const { octree, nodeInfos } of octrees(app, eye)) {
+    nodeInfos.forEach(({ currentLod }, i) => {
+      if (currentLod >= 0) counts[currentLod] = (counts[currentLod] ?? 0) + octree.nodes[i].lods[currentLod].count
+    })
+  }
+  return Array.from(counts, (count) => count ?? 0)
 }
 
 // What draws the splats for a camera, in each layer.
@@ -104,7 +106,7 @@ function octrees(app, eye) {
 
 // Whether every chunk of a streamed file shows the level that it should from here. The engine looks every tenth frame, and draws what it then found
 // ten frames later.
-function isStreamed(app, eye) {
+export function isStreamed(app, eye) {
   const isNear = ({ world }) => world._lastLodCameraPos.distance(eye.getPosition()) <= app.scene.gsplat.lodUpdateDistance
   const isShown = ({ currentLod, optimalLod }) => optimalLod >= 0 && currentLod === optimalLod
   const isWhole = (instance) => !instance.dirtyModifiedPlacements && instance.pendingLoadCount === 0 && instance.nodeInfos.every(isShown)
