@@ -30,7 +30,7 @@ def _read_no(ending: str, *viewers: str) -> dict[str, str]:
 # By the ending of a file: viewer -> why it does not read it.
 UNREAD: dict[str, dict[str, str]] = {
     ".spz": {
-        **_read_no(".spz", "brush", "gdgs"),
+        **_read_no(".spz", "brush", "gdgs", "supersplat-viewer"),
         "gaussian-splats-3d": "GaussianSplats3D 0.4.7 reads .spz up to version 2, and splat-transform writes 3 at least",
         "unity": "UnityGaussianSplatting 1.1.1 reads .spz of version 2 only, and splat-transform writes 3 at least",
     },
@@ -40,7 +40,7 @@ UNREAD: dict[str, dict[str, str]] = {
         **{
             viewer: f"{viewer} reads no splats in glTF"
             for viewer in ("spark", "gaussian-splats-3d", "gsplat-js", "antimatter15", "aframe", "mip", "brush", "lichtfeld", "visionary", "unity",
-                           "metalsplatter", "vk-gaussian-splatting", "gdgs", "kiri", *PLY_ONLY)
+                           "metalsplatter", "vk-gaussian-splatting", "gdgs", "kiri", "supersplat-viewer", *PLY_ONLY)
         },
         **TILES_ONLY,
     },

@@ -18,6 +18,9 @@ import { Group, Vector2, Vector3 } from 'three'
 // A level stays until the zoom is so much beyond its switch, so that nothing flickers where a camera rests.
 const STAYS = 1.02
 
+// Milliseconds until a level whose file did not load is tried again.
+const AGAIN = 5000
+
 export class Levels extends Group {
   // `open`: makes of the URL of a level's file what draws it, an Object3D, or a promise of it. `folder`: where the ladder lies, a URL or the path of
   // one; by default where this module lies.
@@ -25,8 +28,10 @@ export class Levels extends Group {
     const whole = new URL(`${folder}`.replace(/\/?$/, '/'), location.href)
     const answer = await fetch(new URL('levels.json', whole))
     if (!answer.ok) throw new Error(`${answer.url}: ${answer.status} ${answer.statusText}`)
-    const manifest = await answer.json()
-    if (!manifest.middle) throw new Error(`${answer.url} is of a ladder by distance, or of an earlier version: make one by zoom (--by zoom)`)
+    const manifest = await answer.json().catch(() => {
+      throw new Error(`${answer.url} is no levels.json: give the folder of the ladder, as the server knows it`)
+    })
+    if (!manifest.view_pixel) throw new Error(`${answer.url} is of a ladder by distance, or of an earlier version: make one by zoom (--by zoom)`)
     const levels = new Levels(manifest, (file) => open(new URL(file, whole).href))
     await levels.opened(levels.wanted)
     return levels
@@ -39,13 +44,15 @@ export class Levels extends Group {
     this.open = open
     this.drawn = manifest.levels.map(() => null) // what draws each level, once it is there
     this.opening = manifest.levels.map(() => null)
+    this.disposed = false
     this.wanted = manifest.levels.length - 1 // the coarsest, which is the first to be there
     this.shown = this.wanted
   }
 
-  // To be called before each frame. A level is loaded when it is wanted first; until it is there the nearest one is shown.
-  update(camera, renderer) {
-    const zoom = this.zoom(camera, renderer)
+  // To be called before each frame. A level is loaded when it is wanted first; until it is there the nearest one is shown. `height`: of the picture in
+  // pixels, where that is not the whole canvas: of a viewport or a render target.
+  update(camera, renderer, height) {
+    const zoom = this.zoom(camera, renderer, height)
     const stays = [this.fitting(zoom * STAYS), this.fitting(zoom / STAYS)].includes(this.wanted)
     if (!stays) this.wanted = this.fitting(zoom)
     if (!this.opening[this.wanted]) this.opened(this.wanted).catch(console.error)
@@ -55,13 +62,13 @@ export class Levels extends Group {
   }
 
   // How large the middle of the scene is on the canvas, over how large it was in training.
-  zoom(camera, renderer) {
+  zoom(camera, renderer, height = renderer.getDrawingBufferSize(new Vector2()).y) {
     this.updateWorldMatrix(true, false)
     camera.updateWorldMatrix(true, false)
     const middle = new Vector3(...this.manifest.middle).applyMatrix4(this.matrixWorld)
     const projection = camera.projectionMatrix.elements // by columns: 5 is twice the focal length over the height, 15 is 1 without perspective
     const distance = projection[15] === 1 ? 1 : middle.distanceTo(new Vector3().setFromMatrixPosition(camera.matrixWorld))
-    const pixel = (2 * distance) / (projection[5] * renderer.getDrawingBufferSize(new Vector2()).y)
+    const pixel = (2 * distance) / (projection[5] * height)
     return (this.manifest.view_pixel * new Vector3().setFromMatrixScale(this.matrixWorld).x) / pixel
   }
 
@@ -70,14 +77,25 @@ export class Levels extends Group {
     return this.manifest.switches.filter((each) => zoom < each.zoom).length
   }
 
-  // Resolves once a level is there. One that failed is not tried again.
+  // Resolves once a level is there. One that failed is tried again when it is wanted after a while.
   opened(level) {
-    this.opening[level] ??= this.#open(level)
+    this.opening[level] ??= this.#open(level).catch((error) => {
+      setTimeout(() => (this.opening[level] = null), AGAIN)
+      throw error
+    })
     return this.opening[level]
+  }
+
+  // Takes the ladder out of the page, and frees what draws its levels, where that has a `dispose`.
+  dispose() {
+    this.disposed = true
+    this.removeFromParent()
+    this.drawn.forEach((splats) => splats?.dispose?.())
   }
 
   async #open(level) {
     const splats = await this.open(this.manifest.levels[level].file)
+    if (this.disposed) return splats.dispose?.()
     splats.visible = false
     this.drawn[level] = splats
     this.add(splats)

@@ -53,7 +53,7 @@ MOST_LOST = 3.0
 WAYS = ("auto", "zoom", "distance")
 
 # Viewers that choose a level for each chunk by its distance.
-STREAMING = ("playcanvas", "playcanvas-webgpu", "playcanvas-aa", "babylon")
+STREAMING = ("playcanvas", "playcanvas-webgpu", "playcanvas-aa", "supersplat-viewer", "babylon")
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,9 @@ A tile is replaced when its geometric error, seen from the nearest point of its 
 level should be replaced at the zoom z of its switch, at which a base pixel of size p is 1 / z times as large as a pixel: its error is 16 · p / z,
 times the distance of the box over that of the splats. One box holds all splats, those far away too, so that it begins long before most of them.
 
+A camera inside the box is at no distance from it, and would see the finest level wherever it stands. So where the box reaches around the
+camera, each finer level has a `viewerRequestVolume` (3D Tiles 1.1): a sphere around the scene's middle, outside of which it is not shown.
+
 Cesium draws the splats of a glTF only if they are SPZ, by KHR_gaussian_splatting_compression_spz_2, and only if the tileset requires both
 extensions; it takes others for points, whose shader does not compile, and stops (1.145: GaussianSplat3DTileContent, GltfLoader). It also
 wants a matrix, and no rotation, in the node.
@@ -12,6 +15,7 @@ wants a matrix, and no rotation, in the node.
 from __future__ import annotations
 
 import gzip
+import math
 import shutil
 import struct
 from collections.abc import Iterable, Sequence
@@ -41,6 +45,13 @@ TILES, TILESET = "tiles", "tileset.json"
 # px: Cesium's default.
 SCREEN_ERROR = 16
 
+# A camera of Cesium's own sees 60 degrees along the longer side, here of 16 x 9: how many times as far away it is where pixels are as large as those
+# of a camera that sees 45 degrees along the shorter side.
+LENS = math.tan(math.pi / 8) / (9 / 16 * math.tan(math.pi / 6))
+
+# Of the distance from the scene's middle: a camera that is nearer to the box than this has the box around it, or nearly.
+AROUND = 1 / 2
+
 # A point (x, y, z) of a PLY lies at (-x, -z, -y) of a tile: the node turns it by half a turn about z, as glTF's y is up, and 3D Tiles, whose z is
 # up, read a glTF's (x, y, z) as (x, -z, y).
 AXES = (0, 2, 1)
@@ -64,19 +75,44 @@ def errors(manifest: dict[str, Any], approach: Approach | None, canvas: int) -> 
     `approach`: to the box of all levels; None for a ladder by distance, whose levels are made for distances from boxes. `canvas`: its shorter side in
     px, on which the camera's distance depends.
     """
-    pixel = "view_pixel" if approach else "base_pixel"
-    away, pixels = distances(manifest, canvas, pixel), [manifest[pixel] / switch["zoom"] for switch in manifest["switches"]]
-    nearness = [approach.near(distance) / distance if approach else 1.0 for distance in away]
-    return [0.0, *(SCREEN_ERROR * pixel * near for pixel, near in zip(pixels, nearness, strict=True))]
+    pixel = manifest["view_pixel" if approach else "base_pixel"]
+    nearness = [1.0] * len(manifest["switches"])
+    if approach and not _around(approach, away := _away(manifest, canvas)):
+        nearness = [approach.chunk_distance(distance) / distance for distance in away]
+    return [0.0, *(SCREEN_ERROR * pixel / switch["zoom"] * near for switch, near in zip(manifest["switches"], nearness, strict=True))]
 
 
-def tileset(box: list[float], errors: Sequence[float]) -> dict[str, Any]:
-    """The tileset of levels within `box` that have these errors: level_0.glb, level_1.glb, ..."""
+def spheres(manifest: dict[str, Any], approach: Approach | None, canvas: int) -> list[list[float]]:
+    """The spheres (x, y, z, radius) within which levels but the coarsest are shown, from the finest; none where `errors` are enough.
+
+    Parameters as those of `errors`; in the axes of a tile, world units.
+    """
+    if approach is None or not _around(approach, away := _away(manifest, canvas)):
+        return []
+    middle = [-manifest["middle"][axis] for axis in AXES]
+    return [[*middle, distance] for distance in away]
+
+
+def _away(manifest: dict[str, Any], canvas: int) -> list[float]:
+    """The distances from the scene's middle at which levels should be switched before a camera of Cesium's own, world units, rising."""
+    return [LENS * distance for distance in distances(manifest, canvas, "view_pixel")]
+
+
+def _around(approach: Approach, away: Sequence[float]) -> bool:
+    """Whether the box reaches around a camera that is so far away from the scene's middle."""
+    return any(approach.chunk_distance(distance) < AROUND * distance for distance in away)
+
+
+def tileset(box: list[float], errors: Sequence[float], spheres: Sequence[list[float]] = ()) -> dict[str, Any]:
+    """The tileset of levels within `box` that have these errors, and of those that are shown within `spheres` only: level_0.glb, level_1.glb, ..."""
+    # Of a tile whose box is within that of its parent Cesium takes the parent for invisible, too, where the tile is: not of spheres.
+    volume = {"sphere": _sphere_around(box)} if spheres else {"box": box}
     tile: dict[str, Any] = {}
     for number, error in enumerate(errors):
         content = {"uri": f"level_{number}.glb"}
         finer = {"children": [tile]} if tile else {}
-        tile = {"boundingVolume": {"box": box}, "geometricError": error, "refine": "REPLACE", "content": content, **finer}
+        shown = {"viewerRequestVolume": {"sphere": spheres[number]}} if number < len(spheres) else {}
+        tile = {"boundingVolume": volume, **shown, "geometricError": error, "refine": "REPLACE", "content": content, **finer}
     # Beyond this error nothing would be shown; the coarsest level is shown from any distance.
     farthest = 1e9 * max(1.0, tile["geometricError"])
     said = {"extensionsUsed": ["3DTILES_content_gltf"], "extensions": {"3DTILES_content_gltf": EXTENSIONS}}
@@ -93,6 +129,11 @@ def bounding_box(low: Tensor, high: Tensor) -> list[float]:
     """The box between two corners [3], as 3D Tiles write it: its center, then half of each of its axes."""
     center, half = (each[list(AXES)] for each in ((low + high) / -2, (high - low) / 2))
     return [*center.tolist(), *torch.diag(half).flatten().tolist()]
+
+
+def _sphere_around(box: Sequence[float]) -> list[float]:
+    """The sphere around such a box: its center, then its radius."""
+    return [*box[:3], math.hypot(*box[3:])]
 
 
 def _bounds(model: SplatModel) -> tuple[Tensor, Tensor]:
@@ -145,5 +186,6 @@ def write_tiles(folder: Path, canvas: int = CANVAS) -> Path:
     with new_folder(folder / TILES, overwrite=False) as temporary:
         for number, file in enumerate(files):
             write_tile(file, temporary / f"level_{number}.glb")
-        write_json(temporary / TILESET, tileset(bounding_box(low, high), errors(manifest, approach, canvas)), overwrite=False)
+        made = tileset(bounding_box(low, high), errors(manifest, approach, canvas), spheres(manifest, approach, canvas))
+        write_json(temporary / TILESET, made, overwrite=False)
     return folder / TILES / TILESET

@@ -40,7 +40,15 @@ PLAYCANVAS = replace(
     color_steps=(4 / 2047, 4 / 2047, 4 / 1023),
     packing=Packing(log_scales=(-12 + 21 / 255, 9.0, 21 / 255), quats="stereographic"),
 )
-PLAYCANVAS_SOURCE = "playcanvas 2.23.3, gsplatCorner, gsplat and containerCompactWrite shaders (SuperSplat, supersplat-viewer 1.36)"
+PLAYCANVAS_SOURCE = "playcanvas 2.23.3, gsplatCorner, gsplat and containerCompactWrite shaders (SuperSplat)"
+
+# Its pages draw with WebGPU where the browser has it. They ask for a contribution of 1 instead of 3, and sort by distance.
+SUPERSPLAT_VIEWER = Viewer(
+    "supersplat-viewer", "SuperSplat's viewer (superspl.at, exported pages), WebGPU",
+    "@playcanvas/supersplat-viewer 1.36.2, viewer.js; playcanvas 2.23.3, compute-gsplat-common, gsplat-hybrid-renderer", "classic", DILATION / 4,
+    replace(PLAYCANVAS, bucketed=False, boxed=True, radial=True, min_contribution=CONTRIBUTION / 3), read_degrees=UP_TO_3,
+    unlike="without WebGPU it is playcanvas, sorted by distance",
+)  # fmt: skip
 INRIA_UNLIKE = "a splat ends at three standard deviations, rounded up to tiles"
 
 # RGBA of 8 bits, colors of SH degree 0 within 0..1.
@@ -83,6 +91,7 @@ BUILT_IN = (
         "classic", DILATION / 4, replace(PLAYCANVAS, bucketed=False, boxed=True, min_contribution=CONTRIBUTION), read_degrees=UP_TO_3,
         unlike="among splats much larger than the image some pixels differ, 43 dB in all",
     ),
+    SUPERSPLAT_VIEWER,
     Viewer("playcanvas-aa", "PlayCanvas and SuperSplat with antiAlias", PLAYCANVAS_SOURCE, "mip", DILATION / 4, PLAYCANVAS, read_degrees=UP_TO_3),
     Viewer(
         "gaussian-splats-3d", "GaussianSplats3D", "@mkkellogg/gaussian-splats-3d 0.4.7, SplatMaterial3D",
@@ -155,8 +164,7 @@ NOT_IN_FILES = "viewers are named in files: a name begins with a letter or a dig
 
 ALIASES = {
     "inria": "classic",
-    **dict.fromkeys(("supersplat", "supersplat-viewer"), "playcanvas"),
-    **{"mkkellogg": "gaussian-splats-3d", "threejs": "three", "drei": "aframe", "godot": "gdgs"},
+    **{"supersplat": "playcanvas", "mkkellogg": "gaussian-splats-3d", "threejs": "three", "drei": "aframe", "godot": "gdgs"},
     **{"nerfstudio": "gsplat", "nerfstudio-antialiased": "gsplat-antialiased"},
 }
 
@@ -179,7 +187,7 @@ for _viewer in BUILT_IN:
     register_viewer(_viewer.name, _viewer)
 for _alias, _name in ALIASES.items():
     register_viewer(_alias, VIEWERS.get(_name))
-register_viewer("portable", tuple(viewer.name for viewer in BUILT_IN if viewer not in FURTHER))
+register_viewer("portable", tuple(viewer.name for viewer in BUILT_IN if viewer not in (SUPERSPLAT_VIEWER, *FURTHER)))
 VIEWERS.seal()
 
 

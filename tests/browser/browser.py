@@ -49,6 +49,7 @@ VIEWERS: dict[str, tuple[str, dict[str, Any]]] = {
     "playcanvas": ("playcanvas", {}),
     "playcanvas-webgpu": ("playcanvas", {"device": "webgpu"}),
     "playcanvas-aa": ("playcanvas", {"antiAlias": True}),
+    "supersplat-viewer": ("supersplat-viewer", {}),
     "gaussian-splats-3d": ("gaussian-splats-3d", {}),
     "babylon": ("babylon", {}),
     "gsplat-js": ("gsplat", {}),
@@ -126,6 +127,12 @@ class Browser:
         _told("spark", shown, "url => viewer.open(url)", f"{url}/{THREE_JS}")
         return Page("spark", shown)
 
+    def tiles(self, folder: Path) -> Page:
+        """A folder of 3D Tiles in Cesium."""
+        url, shown = self._served(folder), self._started("cesium", {})
+        _told("cesium", shown, "url => viewer.open(url)", f"{url}/tileset.json")
+        return Page("cesium", shown)
+
     def _served(self, folder: Path) -> str:
         """The address of a folder."""
         url = f"/files/{len(self._files)}"
@@ -157,7 +164,7 @@ class Page:
 
     def draw(self, cameras: Sequence[Camera], background: Sequence[float] = (0.0, 0.0, 0.0)) -> list[np.ndarray]:
         """[H, W, 3] float32 in 0..1 for each camera, in the canvas' own 8 bits. Raises BrowserError when a view takes over a minute."""
-        return [self._view(camera, background) for camera in cameras]
+        return [self._drawn(camera, background) for camera in cameras]
 
     def levels(self) -> list[int]:
         """How many splats of each level the last picture has, of a streamed file."""
@@ -172,11 +179,12 @@ class Page:
         """Put a ladder in Spark at a position, turned by a quaternion (x, y, z, w) and enlarged."""
         _told(self._viewer, self._shown, "place => viewer.place(...place)", [list(position), list(quaternion), scale])
 
-    def _view(self, camera: Camera, background: Sequence[float]) -> np.ndarray:
-        matrices = {"projection": projection(camera), "viewmat": opengl(camera)}
-        view = {name: matrix.T.ravel().tolist() for name, matrix in matrices.items()}
-        size = {"width": camera.width, "height": camera.height, "background": list(background)}
-        text = _told(self._viewer, self._shown, "view => viewer.draw(view)", view | size)
+    def chosen(self, cameras: Sequence[Camera]) -> list[list[str]]:
+        """The tiles that Cesium shows from each camera: the names of their files."""
+        return list(_told(self._viewer, self._shown, "views => viewer.chosen(views)", [_view(camera, (0.0, 0.0, 0.0)) for camera in cameras]))
+
+    def _drawn(self, camera: Camera, background: Sequence[float]) -> np.ndarray:
+        text = _told(self._viewer, self._shown, "view => viewer.draw(view)", _view(camera, background))
         pixels = np.frombuffer(base64.b64decode(text), np.uint8).reshape(camera.height, camera.width, 4)
         return pixels[::-1, :, :3].astype(np.float32) / 255
 
@@ -204,6 +212,13 @@ def projection(camera: Camera) -> np.ndarray:
 def opengl(camera: Camera) -> np.ndarray:
     """[4, 4]: world to camera with OpenGL's axes, y up and z backwards."""
     return np.diag([1.0, -1.0, -1.0, 1.0]) @ camera.viewmat.numpy()
+
+
+def _view(camera: Camera, background: Sequence[float]) -> dict[str, Any]:
+    """What the pages call a view."""
+    matrices = {"projection": projection(camera), "viewmat": opengl(camera)}
+    view = {name: matrix.T.ravel().tolist() for name, matrix in matrices.items()}
+    return view | {"width": camera.width, "height": camera.height, "background": list(background)}
 
 
 def _told(viewer: str, shown: Any, script: str, argument: Any) -> Any:

@@ -24,14 +24,15 @@ pytestmark = pytest.mark.browser
 WHITE = (1.0, 1.0, 1.0)
 
 # dB, where it is less than ALIKE: gsplat.js rounds its picture from the front to the back, and keeps rotations in 8 bits.
-ALIKE_IN = {"gsplat-js": 42.0}
+# SuperSplat's viewer has 44 in a view of the demo, for no known reason.
+ALIKE_IN = {"gsplat-js": 42.0, "supersplat-viewer": 43.0}
 
 # dB, amid splats larger than the picture and beside it: 39 to 52 by the view in PlayCanvas on WebGPU, for no known reason, and 43 in Babylon.js,
 # which keeps rotations in 8 bits.
 SURROUNDED = ALIKE_IN | {"playcanvas-webgpu": 42.0, "babylon": 42.0}
 
-# dB, in an unbounded scene: 43 in PlayCanvas on WebGPU, 42 in gsplat.js.
-UNBOUNDED = {"playcanvas-webgpu": 40.0, "gsplat-js": 40.0}
+# dB, in an unbounded scene: 43 in PlayCanvas on WebGPU and in SuperSplat's viewer, 42 in gsplat.js.
+UNBOUNDED = {"playcanvas-webgpu": 40.0, "supersplat-viewer": 40.0, "gsplat-js": 40.0}
 
 
 @pytest.fixture

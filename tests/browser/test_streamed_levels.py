@@ -144,6 +144,17 @@ def test_a_level_looks_as_we_say_from_where_it_is_shown(
     assert all(other < likeness[level] - APART for number, other in enumerate(likeness) if number != level)
 
 
+def test_supersplats_viewer_changes_levels_once_it_is_told_to(
+    browser: Browser, ladder: Path, settings: dict[str, Any], switches: list[float]
+) -> None:
+    """By itself it shows the finest level from everywhere, of a scene with less than millions of splats."""
+    by_itself = browser.stream("supersplat-viewer", ladder / STREAMED, {})
+    assert shown(by_itself, ladder, switches[-1] * AWAY)[0] == pytest.approx(1)
+    told = browser.stream("supersplat-viewer", ladder / STREAMED, settings)
+    for distance, level in ((switches[0] / AWAY, 0), (switches[0] * AWAY, 1), (switches[1] * AWAY, 2)):
+        assert shown(told, ladder, distance)[level] > 0.95
+
+
 def test_levels_by_distance_are_shown_as_they_were_made_for(browser: Browser, by_distance: tuple[Path, Ladder]) -> None:
     """A walk nearer: the engine shows the splats of each level that we say, and its pictures are ours."""
     folder, made = by_distance

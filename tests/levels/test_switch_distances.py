@@ -10,7 +10,10 @@ from two_levels import CHUNKS, LADDER
 from mipmap_plugin.formats.streamed_sog import Chunk
 from mipmap_plugin.levels.distance.chunks import box_distances
 from mipmap_plugin.levels.streamed import DIRECTIONS, Approach, distances, progression, viewer_settings
-from mipmap_plugin.levels.tiles import SCREEN_ERROR, bounding_box, bounds, errors, tileset
+from mipmap_plugin.levels.tiles import SCREEN_ERROR, bounding_box, bounds, errors, spheres, tileset
+
+# The focal length of Cesium's own camera, of 60 degrees along the longer side, on a canvas of 16 x 9 whose shorter side has 1000 px.
+CESIUMS = 1000 * 16 / 9 / 2 / math.tan(math.radians(30))
 
 APPROACH = Approach.to([2.0, 0.5, 0.5], CHUNKS)
 
@@ -67,20 +70,34 @@ def test_what_playcanvas_takes_for_levels_by_distance_of_a_scene_in_small_units_
 
 def test_a_tile_is_replaced_at_its_switch():
     """Where a base pixel of 0.01 units at the scene's middle is seen with 0.7 px, the error of the tile that is replaced there has 16 at its box."""
-    focal, box = 500 / math.tan(math.radians(22.5)), (torch.tensor([-3.0, -4.0, -5.0]), torch.tensor([3.0, 4.0, 5.0]))
+    box = (torch.tensor([-3.0, -4.0, -5.0]), torch.tensor([3.0, 4.0, 5.0]))
     approach = Approach.to_box([0.0, 0.0, 0.0], *box)
     finest, *coarser = errors(LADDER, approach, 1000)
-    assert finest == 0
+    assert finest == 0 and spheres(LADDER, approach, 1000) == []
     for error, zoom in zip(coarser, (0.7, 0.35), strict=True):
-        eyes = focal * 0.01 / zoom * DIRECTIONS
+        eyes = CESIUMS * 0.01 / zoom * DIRECTIONS
         away = box_distances(box[0].double()[None], box[1].double()[None], eyes)
-        assert float((focal * error / away).median()) == pytest.approx(SCREEN_ERROR, rel=0.02)
+        assert float((CESIUMS * error / away).median()) == pytest.approx(SCREEN_ERROR, rel=0.02)
 
 
-def test_a_tile_that_reaches_far_beyond_its_scene_is_replaced_all_the_same():
+def test_in_a_tile_that_reaches_around_the_camera_a_level_is_shown_up_to_its_switch():
     """A camera inside the box is at no distance from it, at which Cesium would never show a coarser level."""
-    approach = Approach.to_box([0.0, 0.0, 0.0], torch.full((3,), -1e3), torch.full((3,), 1e3))
-    assert errors(LADDER, approach, 1000)[1:] == pytest.approx([SCREEN_ERROR * 0.01 / zoom / 2 for zoom in (0.7, 0.35)])
+    middle = [1.0, 2.0, 3.0]
+    approach = Approach.to_box(middle, torch.full((3,), -1e3), torch.full((3,), 1e3))
+    made = LADDER | {"middle": middle}
+    assert errors(made, approach, 1000)[1:] == pytest.approx([SCREEN_ERROR * 0.01 / zoom for zoom in (0.7, 0.35)])
+    for sphere, zoom in zip(spheres(made, approach, 1000), (0.7, 0.35), strict=True):
+        assert sphere == pytest.approx([-1, -3, -2, CESIUMS * 0.01 / zoom])
+
+
+def test_a_tile_that_is_shown_within_a_sphere_is_no_box_in_a_box():
+    """Of boxes within boxes Cesium hides the parent, too, where no child is asked for."""
+    made = tileset([1.0, 2.0, 3.0, 2.0, 0, 0, 0, 3.0, 0, 0, 0, 6.0], [0.0, 1.0, 2.0], [[5.0] * 4, [6.0] * 4])
+    coarsest = made["root"]
+    middle = coarsest["children"][0]
+    finest = middle["children"][0]
+    assert all(tile["boundingVolume"] == {"sphere": [1.0, 2.0, 3.0, 7.0]} for tile in (coarsest, middle, finest))
+    assert [tile.get("viewerRequestVolume") for tile in (coarsest, middle, finest)] == [None, {"sphere": [6.0] * 4}, {"sphere": [5.0] * 4}]
 
 
 def test_tiles_of_levels_by_distance_are_replaced_at_the_distance_of_their_box():

@@ -56,8 +56,8 @@ def test_the_usual_viewers_have_the_usual_settings():
     assert find_viewer("classic").effects(Effects(2)) == Effects(2)
 
 
-def test_supersplat_is_playcanvas_and_every_record_is_under_its_name():
-    assert find_viewer("supersplat") is find_viewer("playcanvas")
+def test_supersplats_editor_is_playcanvas_and_every_record_is_under_its_name():
+    assert find_viewer("supersplat") is find_viewer("playcanvas") is not find_viewer("supersplat-viewer")
     assert all(find_viewer(viewer.name) is viewer and viewer.source and viewer.title for viewer in BUILT_IN)
 
 

@@ -28,17 +28,16 @@ export function readPixels(gl, { width, height }, behind = null) {
   return base64(bytes)
 }
 
-// Makes the canvas' WebGPU context hand out a texture of ours: Chromium's software device draws, but has no canvas to draw on.
+// Makes WebGPU contexts hand out a texture of ours: Chromium's software device draws, but has no canvas to draw on.
 export function drawToTexture() {
-  const context = canvas.getContext('webgpu')
   const target = { device: null, texture: null }
   let format = ''
-  context.configure = (settings) => {
-    target.device = settings.device
+  GPUCanvasContext.prototype.configure = (settings) => {
+    Object.assign(target, { device: settings.device, texture: null })
     format = settings.format
   }
-  context.getCurrentTexture = () => {
-    const size = [canvas.width, canvas.height]
+  GPUCanvasContext.prototype.getCurrentTexture = function () {
+    const size = [this.canvas.width, this.canvas.height]
     if (target.texture?.width !== size[0] || target.texture?.height !== size[1]) {
       const usage = GPUTextureUsage.RENDER_ATTACHMENT | GPUTextureUsage.COPY_SRC | GPUTextureUsage.TEXTURE_BINDING
       target.texture = target.device.createTexture({ size, format, usage })

@@ -35,6 +35,15 @@ export async function start() {
     group.scale.setScalar(3)
     found.in_a_group = zoomAt(levels, camera, middle.map((each) => 3 * each), 30)
     group.remove(levels)
+    const rig = new THREE.Group().add(camera)
+    rig.rotation.y = Math.PI / 2
+    rig.scale.setScalar(2)
+    const [x, y, z] = middle // a camera that the rig puts 10 units away along x
+    camera.position.set(-z / 2, y / 2, (x + 10) / 2)
+    found.camera_in_a_rig = levels.zoom(camera, renderer)
+    rig.remove(camera)
+    camera.position.set(x, y, z + 10)
+    found.render_target = levels.zoom(camera, renderer, 50)
     return found
   }
 
@@ -45,6 +54,36 @@ export async function start() {
     await levels.opened(levels.wanted).catch(() => null)
     levels.update(camera, renderer)
     return [levels.wanted, levels.shown, levels.drawn.map((splats) => splats && splats.visible)]
+  }
+
+  // How often the finest level was asked for, whose file fails once: when it is wanted first, in the next frames, and when the module's timer is over.
+  async function again(Levels, manifest) {
+    const { setTimeout } = globalThis
+    let over = null
+    globalThis.setTimeout = (call) => (over = call)
+    let asked = 0
+    const levels = new Levels(manifest, async () => {
+      asked += 1
+      if (asked === 1) throw new Error('the first answer of this test')
+      return new THREE.Group()
+    })
+    const first = [await from(levels, 10), asked]
+    const next = [await from(levels, 10), asked]
+    globalThis.setTimeout = setTimeout
+    over()
+    return { first, next, later: [await from(levels, 10), asked] }
+  }
+
+  // Of a ladder that is disposed of while a level is on its way: which levels were freed, whether it is in the scene, and what it still draws.
+  async function disposed(Levels, manifest) {
+    const freed = []
+    const levels = new Levels(manifest, async (file) => Object.assign(new THREE.Group(), { dispose: () => freed.push(file) }))
+    const scene = new THREE.Scene().add(levels)
+    await levels.opened(2)
+    const coming = levels.opened(0)
+    levels.dispose()
+    await coming
+    return [freed, scene.children.length, levels.children.length]
   }
 
   async function why(loading) {
@@ -65,6 +104,9 @@ export async function start() {
         early: await from(early, 10),
         inside: await from(inside, 0),
         at_once: await from(await Levels.load(() => new THREE.Group(), url), 10),
+        again: await again(Levels, levels.manifest),
+        disposed: await disposed(Levels, levels.manifest),
+        no_manifest: await why(Levels.load(open, `${url}/page`)),
         no_folder: await why(Levels.load(open, '/pages/')),
         by_distance: await why(Levels.load(open, `${url}/distance/`)),
       }

@@ -4,6 +4,9 @@ import { canvas, drawToTexture, drawUntil, nextFrame, readPixels, readTexture } 
 // 1 - cosine of the milliradian that the engine lets a camera turn before it sorts again.
 const SORT_TURN = 1e-6
 
+// World units that it lets a camera move before it sorts again by distance.
+const SORT_MOVE = 1e-3
+
 // Milliseconds that the levels of one view may take to load.
 const LONGEST_LOAD = 30000
 
@@ -76,17 +79,19 @@ export async function start({ device: type = 'webgl2', ...settings }) {
       return target ? readTexture(target) : readPixels(device.gl, view)
     },
 
-    // How many splats of each level the last picture has, of a streamed file.
-    levels() {
-      const counts = []
-      for (const { octree, nodeInfos } of octrees(app, eye)) {
-        nodeInfos.forEach(({ currentLod }, i) => {
-          if (currentLod >= 0) counts[currentLod] = (counts[currentLod] ?? 0) + octree.nodes[i].lods[currentLod].count
-        })
-      }
-      return Array.from(counts, (count) => count ?? 0)
-    },
+    levels: () => levelsOf(app, eye),
   }
+}
+
+// How many splats of each level the last picture has, of a streamed file.
+export function levelsOf(app, eye) {
+  const counts = []
+  for (const { octree, nodeInfos } of octrees(app, eye)) {
+    nodeInfos.forEach(({ currentLod }, i) => {
+      if (currentLod >= 0) counts[currentLod] = (counts[currentLod] ?? 0) + octree.nodes[i].lods[currentLod].count
+    })
+  }
+  return Array.from(counts, (count) => count ?? 0)
 }
 
 // What draws the splats for a camera, in each layer.
@@ -101,7 +106,7 @@ function octrees(app, eye) {
 
 // Whether every chunk of a streamed file shows the level that it should from here. The engine looks every tenth frame, and draws what it then found
 // ten frames later.
-function isStreamed(app, eye) {
+export function isStreamed(app, eye) {
   const isNear = ({ world }) => world._lastLodCameraPos.distance(eye.getPosition()) <= app.scene.gsplat.lodUpdateDistance
   const isShown = ({ currentLod, optimalLod }) => optimalLod >= 0 && currentLod === optimalLod
   const isWhole = (instance) => !instance.dirtyModifiedPlacements && instance.pendingLoadCount === 0 && instance.nodeInfos.every(isShown)
@@ -109,14 +114,16 @@ function isStreamed(app, eye) {
   return all.length === 0 || (managersOf(app, eye).every(isNear) && all.every(isWhole))
 }
 
-// Whether the order that is drawn is that of this camera, and none is on its way.
-function isSorted(app, eye) {
+// Whether the order that is drawn is that of this camera, and none is on its way. Sorted by distance it depends on the camera's place only.
+export function isSorted(app, eye) {
   const managers = managersOf(app, eye)
-  const settled = ({ cpuSorter, world, sortNeeded, lastSortCameraFwd }) =>
-    !sortNeeded &&
-    !cpuSorter?.jobsInFlight &&
-    !cpuSorter?.pendingSorted &&
-    world.currentVersion === world.lastWorldStateVersion &&
-    lastSortCameraFwd.dot(eye.forward) > 1 - SORT_TURN
+  const isOfCamera = ({ lastSortCameraFwd, lastSortCameraPos }) =>
+    app.scene.gsplat.radialSorting ? lastSortCameraPos.distance(eye.getPosition()) <= SORT_MOVE : lastSortCameraFwd.dot(eye.forward) > 1 - SORT_TURN
+  const settled = (manager) =>
+    !manager.sortNeeded &&
+    !manager.cpuSorter?.jobsInFlight &&
+    !manager.cpuSorter?.pendingSorted &&
+    manager.world.currentVersion === manager.world.lastWorldStateVersion &&
+    isOfCamera(manager)
   return managers.length > 0 && managers.every(settled)
 }
