@@ -12,7 +12,7 @@ import numpy as np
 
 from mipmap_plugin.formats.ply import read_ply, write_ply
 
-# The header: magic, version, splats, SH degree, bits of fractions, flags, and a byte that is reserved.
+# The header, inside the gzip: magic, version, splats, SH degree, bits of fractions, flags, and a byte that is reserved (nianticlabs/spz).
 HEADER = struct.Struct("<4sIIBBBB")
 
 # A coefficient c is stored as ZERO + ONE · c.
