@@ -11,7 +11,7 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance.chunks import Chunks
-from mipmap_plugin.levels.distance.rule import DistanceRule, focal
+from mipmap_plugin.levels.distance.rule import DistanceRule, focal_along_shorter_side
 from mipmap_plugin.splatting.harmonics import C0
 
 
@@ -37,7 +37,7 @@ class Mixture:
 
     def shown(self, camera: Camera) -> Tensor:
         """The level at which the camera sees each chunk, [C]."""
-        return self.rule.level(self.chunks.distances(camera.center) / focal(camera))
+        return self.rule.level(self.chunks.distances(camera.center) / focal_along_shorter_side(camera))
 
     def splats(self, camera: Camera) -> Gaussians:
         """The splats that the camera sees."""
