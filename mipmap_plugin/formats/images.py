@@ -14,7 +14,8 @@ from PIL import ExifTags, Image
 from torch import Tensor
 
 from mipmap_plugin.errors import SceneError, SettingsError, ShapeError, brief
-from mipmap_plugin.formats.atomic import new_file, no_file
+from mipmap_plugin.formats.atomic import new_file
+from mipmap_plugin.formats.nodes import no_file
 from mipmap_plugin.limits import check_image
 
 # Pillow's modes for 16-bit gray. It reads 16-bit color as 8 bits, keeping the high byte.
@@ -127,14 +128,6 @@ def pillow_bicubic(image: Tensor, size: tuple[int, int]) -> Tensor:
     height, width = size
     small = Image.fromarray(_bytes(image)).resize((width, height), Image.Resampling.BICUBIC)
     return torch.from_numpy(np.asarray(small).astype(np.float32)) / 255
-
-
-def is_file(path: Path) -> bool:
-    """Whether there is a file; False also for names that the system does not accept, which lists of images may contain."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
 
 
 def image_size(path: str | Path) -> tuple[int, int]:

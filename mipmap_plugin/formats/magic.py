@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from mipmap_plugin.errors import CheckpointError, brief
-from mipmap_plugin.formats.atomic import no_file
+from mipmap_plugin.formats.nodes import no_file
 
 # Beginning of a placeholder for a file that Git LFS has not fetched.
 LFS_POINTER = b"version https://git-lfs"
