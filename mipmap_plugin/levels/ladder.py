@@ -162,8 +162,11 @@ def _shown(levels: list[Level], yardstick: Yardstick, end: float) -> tuple[list[
 
 
 def _switches(levels: Sequence[Level], yardstick: Yardstick, end: float) -> list[Switch]:
-    """The best zooms to change between neighboring levels: between their scales, or above both where the coarser is better at the finer's own scale,
-    as merged splats may be where a viewer draws no small ones, or down to the end of the coarser's band where the finer is better at its scale."""
+    """The best zooms to change between neighboring levels. Each is sought between the scales of the two, with two exceptions.
+
+    Where the coarser level is better at the finer one's own scale, as merged splats may be where a viewer draws no small ones, it is sought above
+    both. Where the finer one is better at the coarser one's scale, it is sought down to the end of the coarser one's band. `end`: of the ladder.
+    """
     switches = []
     for above, (finer, coarser) in zip([levels[0], *levels], pairwise(levels), strict=False):
 
