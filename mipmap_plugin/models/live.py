@@ -46,9 +46,9 @@ ANCHORS = {
 
 # Its networks; those of the second line are None or missing if they are not used.
 NETWORKS = {
-    **{"opacity_mlp": "mlp_opacity", "cov_mlp": "mlp_cov", "color_mlp": "mlp_color"},
-    **{"feature_bank_mlp": "mlp_feature_bank", "appearance": "embedding_appearance"},
-}
+    "opacity_mlp": "mlp_opacity", "cov_mlp": "mlp_cov", "color_mlp": "mlp_color",
+    "feature_bank_mlp": "mlp_feature_bank", "appearance": "embedding_appearance",
+}  # fmt: skip
 
 # Deformable 3D Gaussians keeps its network in another object; among the classes with these tensors only its own has no `capture`.
 MAY_MOVE = (
