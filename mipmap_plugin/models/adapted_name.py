@@ -11,7 +11,7 @@ from mipmap_plugin.formats.splat_transform import EXCHANGE, READ_ONLY, WRITTEN
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.families import BUILT_IN, find_family
 from mipmap_plugin.models.family import Files
-from mipmap_plugin.models.zipped_folder import opened
+from mipmap_plugin.models.zipped_folder import unzipped
 
 GLTF = (".glb", ".gltf")
 COMPRESSED = EXCHANGE["compressed"][1]
@@ -56,7 +56,7 @@ def _endings(checkpoint: Path, name: str, viewer: str | None) -> tuple[str, str]
         family = find_family(detect(checkpoint).family)
     except MipmapPluginError:  # whoever loads it says so
         return "", ""
-    if opened(checkpoint) != checkpoint:  # a folder in a zip archive
+    if unzipped(checkpoint) != checkpoint:  # a folder in a zip archive
         return Path(name).suffix, _of_folder(checkpoint, viewer)
     if family in BUILT_IN:
         written = ".ply" if family.name in ("zipped", "gltf", "exchange") else _of_folder(checkpoint, viewer)

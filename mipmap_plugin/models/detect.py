@@ -13,7 +13,7 @@ from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_l
 from mipmap_plugin.models.family import OF_SPLATS, Family, Files, Match
 from mipmap_plugin.models.folders import PHOTOGRAPHS, checkpoints_in, holds_points, is_model_folder, meant_instead, model_folders_below
 from mipmap_plugin.models.places import PARTS, has_report
-from mipmap_plugin.models.zipped_folder import opened, retold, told
+from mipmap_plugin.models.zipped_folder import retold, unzipped, with_archives_named
 
 # Suffixes of files of splats besides PLY.
 EXCHANGED = (".spz", ".sog", ".splat", ".ksplat", ".glb", ".gltf")
@@ -59,8 +59,8 @@ def detect(path: str | Path, *, iteration: int | None = None) -> Checkpoint:
     path = settled(path_of(path))
     if path.is_dir():
         return _detect_folder(path, iteration)
-    if (folder := opened(path)) != path:
-        with retold(told):
+    if (folder := unzipped(path)) != path:
+        with retold(with_archives_named):
             return _detect_folder(folder, iteration)
     if iteration is not None and path.exists():
         raise CheckpointError(f"{path} is a file and has no iterations; give its model folder to choose iteration {iteration}")

@@ -18,7 +18,7 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.levels.distance.chunks import Chunks, shrunk
 from mipmap_plugin.levels.distance.ladder import by_distance, scene_of
-from mipmap_plugin.levels.distance.mixture import Mixture, together
+from mipmap_plugin.levels.distance.mixture import Mixture, joined
 from mipmap_plugin.levels.distance.rule import DistanceRule, focal_along_shorter_side, is_unbounded, nearest
 from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground
 from mipmap_plugin.levels.distance.yardstick import Walks
@@ -91,7 +91,7 @@ def test_splats_in_no_picture_have_no_part_in_the_rule():
     away = eye / eye.norm()
     behind, before = (tiny.gaussians(count, degree=0, spread=1e-4, seed=count) for count in (150, 45))
     hidden = [replace(behind, means=behind.means + eye + 0.2 * away), replace(before, means=before.means + eye - 0.005 * away)]
-    base, cluttered = (wrap_model(VanillaModel.from_gaussians(together(parts), tiny.model(1).trained), cameras=views, backend="cpu", threads=1)
+    base, cluttered = (wrap_model(VanillaModel.from_gaussians(joined(parts), tiny.model(1).trained), cameras=views, backend="cpu", threads=1)
                        for parts in ([ball], [ball, *hidden]))  # fmt: skip
     request = LadderRequest("playcanvas", coarsest=1 / 8)
     rules = [scene_of(each, request, request.first_band(each)) for each in (base, cluttered)]
