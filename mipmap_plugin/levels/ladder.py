@@ -16,7 +16,7 @@ from typing import Any
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.frozen_base import FrozenBase
-from mipmap_plugin.levels.contents import Contents, CurvePoint, LeftOut, Level, Switch
+from mipmap_plugin.levels.contents import Contents, LeftOut, Level, Switch, ZoomPoint
 from mipmap_plugin.levels.distance.ladder import by_distance, make_levels_by_distance
 from mipmap_plugin.levels.finished import Ladder
 from mipmap_plugin.levels.manifest import manifest
@@ -184,10 +184,10 @@ def _switches(levels: Sequence[Level], yardstick: Yardstick, end: float) -> list
     return switches
 
 
-def _curve(levels: Sequence[Level], edges: Sequence[float], yardstick: Yardstick, base_db: Callable[[float], float]) -> list[CurvePoint]:
+def _curve(levels: Sequence[Level], edges: Sequence[float], yardstick: Yardstick, base_db: Callable[[float], float]) -> list[ZoomPoint]:
     """The quality at falling zooms, of the level that is shown at each. `edges`: the ends of the levels' zooms, one more than levels."""
     return [
-        CurvePoint(zoom, number, yardstick.psnr(level.adapted, zoom), base_db(zoom))
+        ZoomPoint(zoom, number, yardstick.psnr(level.adapted, zoom), base_db(zoom))
         for number, (level, high, low) in enumerate(zip(levels, edges, edges[1:], strict=False))
         for zoom in reversed(zooms_between(min(low, high), high, CURVE_STEP))
     ]
