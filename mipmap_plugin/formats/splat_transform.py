@@ -244,11 +244,6 @@ def _mode(file: Path, kind: str = "ply") -> str | None:
     return render_mode(read_header(file).comments)
 
 
-def is_glb(path: Path) -> bool:
-    """Whether a path is that of a binary glTF."""
-    return written_ending(path) == ".glb"
-
-
 def is_spz(path: Path) -> bool:
     """Whether a path is that of an SPZ."""
     return written_ending(path) == ".spz"

@@ -15,7 +15,7 @@ from mipmap_plugin.errors import OutputExists, SettingsError, plural, some_of
 from mipmap_plugin.formats.atomic import absolute, named, refuse_output, refuse_to_lose
 from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.formats.ply import read_header
-from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_glb, is_spz, refuse_ending, refuse_exchange, written_ending
+from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_spz, refuse_ending, refuse_exchange, written_ending
 from mipmap_plugin.formats.spz import fraction_for
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
@@ -80,7 +80,7 @@ def refuse_format(path: Path, trained: TrainedScale, parameters: Mapping[str, Te
     if trained.keeps_filter:
         own = f"the filter of their own project ({trained.told()})"
         raise SettingsError(f"{path}: these splats need {own}; give a .ply or a folder, or adapt for a viewer if the family allows it")
-    if not is_glb(path):
+    if written_ending(path) != ".glb":
         refuse_exchange(path)
     if is_spz(path):
         refuse_far(path, parameters, "give a .sog or a .ply")
