@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.start.blend_weights import SHOWN
+from mipmap_plugin.adaptation.start.matching import PARTS
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects, colorless
@@ -77,15 +78,15 @@ class Painter:
         return self.draw(splats, camera).over(torch.tensor(self.effects.background))
 
     def weighed(self, splats: Splats, cameras: Sequence[Camera]) -> tuple[Tensor, float]:
-        """`blend_weights.weighed` of splats on the disk: the mean blend weight [N] of each over views, px, and the fraction that a view shows."""
-        total, shown = torch.zeros(len(splats)), 0.0
-        for view in cameras:
+        """`blend_weights.weighed` of splats on the disk: blend weights [N, P], px, and the fraction of the splats that a view shows."""
+        total, shown = torch.zeros(PARTS, len(splats)), 0.0
+        for number, view in enumerate(cameras):
             weights = torch.zeros(len(splats))
             for strip in strips(view):
                 self._weigh(splats, strip, weights)
-            total += weights / len(cameras)
+            total[number % PARTS] += weights / len(cameras)
             shown += float((weights > SHOWN).float().mean()) / len(cameras)
-        return total, shown
+        return total.T, shown
 
     def _weigh(self, splats: Splats, camera: Camera, weights: Tensor) -> None:
         """Add the blend weight of each splat in a view to `weights` [N]."""

@@ -16,7 +16,7 @@ from mipmap_plugin.adaptation.start.base_weights import note_on_hidden
 from mipmap_plugin.adaptation.start.blend_weights import may_show, whole_weights
 from mipmap_plugin.adaptation.start.candidates import start_name
 from mipmap_plugin.adaptation.start.closed_form import FormSettings, closed_form, draws_alike, filter_suffices
-from mipmap_plugin.adaptation.start.matching import matched_opacities
+from mipmap_plugin.adaptation.start.matching import matched_opacities, sweeps_over
 from mipmap_plugin.adaptation.start.merging import merge_down, merge_seen
 from mipmap_plugin.adaptation.start.strength import Bounds, Candidate, Merger, MergingCosts
 from mipmap_plugin.camera import Camera, evenly
@@ -66,21 +66,21 @@ class StartSearch:
         self._take(FORMED, start_name(self.forms), formed)
 
     def _measured(self) -> Tensor:
-        """[N]: the blend weights of the base's splats, in target pixels of a view, from as many views as show enough of them, as without tiles.
+        """[N, P]: the blend weights of the base's splats, in target pixels of a view, from as many views as show enough of them, as without tiles.
 
         But always in views of their own size (`base_weights.HALF`).
         """
         scene, painter = self.scene, self.scene.painter(self.scene.base_effects)
         first = evenly(scene.views.adapted, LEAST_VIEWS)
         weights, shown = painter.weighed(scene.base, first)
-        self.views = evenly(scene.views.adapted, views_for(shown))
-        if further := [view for view in self.views if view not in first]:
+        if further := [view for view in evenly(scene.views.adapted, views_for(shown)) if view not in first]:
             weights = weights.lerp(painter.weighed(scene.base, further)[0], len(further) / (len(first) + len(further)))
+        self.views = [*first, *further]
         weights, opacities, self.shown = weights * scene.scale**2, [], []
         for core in scene.cores:
             gaussians = scene.base.gaussians(core, colored=False)
             _, whole = self._sizes(gaussians)
-            self.shown.append(may_show(weights[core], whole, gaussians.means, scene.views.adapted, self.views))
+            self.shown.append(may_show(weights[core].sum(1), whole, gaussians.means, scene.views.adapted, self.views))
             opacities.append(gaussians.opacities)
         self.notes = note_on_hidden(torch.cat(self.shown), torch.cat(opacities))
         return weights
@@ -152,7 +152,7 @@ class StartSearch:
         return own, whole
 
     def _match(self, name: str, wanted: Tensor, whole: Tensor) -> None:
-        """Give the splats opacities with which they have the `wanted` blend weights [N] (`start.matching`), and write them again.
+        """Give the splats opacities with which they have the `wanted` blend weights [N, P] (`start.matching`), and write them again.
 
         `whole` [N]: the weights that they would have if nothing hid them.
         """
@@ -160,12 +160,12 @@ class StartSearch:
         views = [view.zoomed(self.scene.scale) for view in self.views]
         painter = self.scene.painter(self.scene.target)
 
-        def weights_of(opacities: Tensor) -> Tensor:
-            splats.opacities = opacities
-            return painter.weighed(splats, views)[0]
+        def weights_of(opacities: Tensor, part: int, parts: int) -> Tensor:
+            splats.opacities, some = opacities, views[part::parts]
+            return painter.weighed(splats, some)[0].sum(1) * (len(some) / len(views))
 
         opacities = torch.cat([part.mapped()[0][:, -1] for part in splats.parts]).sigmoid()
-        opacities = matched_opacities(opacities, wanted, whole, weights_of)
+        opacities = matched_opacities(opacities, wanted, whole, weights_of, sweeps_over(views).usual)
         for number, (part, matched) in enumerate(zip(splats.parts, opacities.split([*map(len, splats.parts)]), strict=True)):
             model = self.scene.for_target(part.parameters())
             model.reshape(lambda gaussians: (gaussians.scales, matched))  # noqa: B023  # it is called at once

@@ -11,7 +11,7 @@ from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS, pixel_size, views_f
 from mipmap_plugin.adaptation.start.blend_weights import may_show, weighed, whole_weights
 from mipmap_plugin.adaptation.start.clock import Clock
 from mipmap_plugin.adaptation.start.problem import StartProblem
-from mipmap_plugin.camera import evenly
+from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.render_settings import MIN_ALPHA
@@ -31,13 +31,14 @@ class BaseWeights:
         self._problem, self._clock = problem, clock
         self._of_base: tuple[Tensor, Tensor] | None = None  # the base's means and its pixel size
         self.count: int | None = None  # of the views that show enough of the splats; None as long as it is not known
+        self.views: list[Camera] = []  # these views, in the order in which they were weighed
         self.size = 1.0  # fraction of their size at which views are weighed: `HALF`, or less where a time budget leaves no time for large ones
         self.shown = torch.empty(0, dtype=torch.bool)  # which splats views show (`may_show`)
         self.whole_of_base = torch.empty(0)  # the base's splats' weights if nothing hid them (`whole_weights`)
         self.notes: list[str] = []  # on what they show
 
     def measured(self, base: SplatModel) -> Tensor:
-        """[N]: the blend weights of the base's splats, in target pixels of a view, from as many views as show enough of them."""
+        """[N, P]: the blend weights of the base's splats (`weighed`), in target pixels of a view, from as many views as show enough of them."""
         problem, gaussians = self._problem, base.gaussians(self._problem.views[0]).detach()
 
         def over(numbers: Sequence[int], size: float) -> tuple[Tensor, float]:
@@ -57,8 +58,8 @@ class BaseWeights:
                 weights = weights.lerp(over(further, self.size)[0], part)
         weights = weights * problem.scale**2
         self.whole_of_base = self.whole(gaussians, self.pixel_size(gaussians.means))
-        looked_at = evenly(problem.views, self.count)
-        self.shown = may_show(weights, self.whole_of_base, gaussians.means, problem.views, looked_at)
+        self.views = [problem.views[number] for number in (*first, *further)]
+        self.shown = may_show(weights.sum(1), self.whole_of_base, gaussians.means, problem.views, self.views)
         self.notes += note_on_hidden(self.shown, gaussians.opacities)
         return weights
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 
 import torch
 from torch import Tensor
@@ -12,6 +13,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.parallel import max_threads, together
 from mipmap_plugin.adaptation.pixel_size import pictured
 from mipmap_plugin.adaptation.start.closed_form import filter_variance
+from mipmap_plugin.adaptation.start.matching import PARTS
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects, colorless
@@ -36,17 +38,18 @@ def blend_weights(gaussians: Gaussians, views: Sequence[Camera], backend: Backen
 
 
 def weighed(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects, size: float = 1.0) -> tuple[Tensor, float]:
-    """`blend_weights`, and the fraction of the splats that a view shows, mean over `views`; what is hidden behind others does not count.
+    """What each part of the views (`matching.PARTS`) adds to `blend_weights`, [N, P], and the fraction of the splats that a view shows.
 
-    `size`: a fraction of the views' own, at which they are drawn; the dilation keeps its size in the world.
+    That is the mean over `views`; what is hidden behind others does not count. `size`: a fraction of the views' own, at which they are drawn; the
+    dilation keeps its size in the world.
     """
-    total, shown = (torch.zeros_like(gaussians.opacities) for _ in range(2))
+    total, shown = gaussians.opacities.new_zeros(PARTS, len(gaussians)), torch.zeros_like(gaussians.opacities)
     views = views if size == 1 else [view.zoomed(size) for view in views]
     effects = replace(effects, eps2d=effects.eps2d * size**2, settings=effects.settings.finer(size))
-    for some in _of_views(gaussians, views, backend, effects):
-        total += some.sum(0)
-        shown += (some > SHOWN * size**2).sum(0)
-    return total / (len(views) * size**2), float(shown.mean()) / len(views)
+    for number, weights in enumerate(chain.from_iterable(_of_views(gaussians, views, backend, effects))):
+        total[number % PARTS] += weights
+        shown += weights > SHOWN * size**2
+    return total.T / (len(views) * size**2), float(shown.mean()) / len(views)
 
 
 def _of_views(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects) -> Iterator[Tensor]:

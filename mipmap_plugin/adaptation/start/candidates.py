@@ -17,7 +17,6 @@ from mipmap_plugin.adaptation.start.base_weights import BaseWeights
 from mipmap_plugin.adaptation.start.clock import Clock, start_clock
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike
 from mipmap_plugin.adaptation.start.matcher import Matcher
-from mipmap_plugin.adaptation.start.matching import ROUNDS
 from mipmap_plugin.adaptation.start.merging import MergingRounds, merge_down, merge_seen
 from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.adaptation.start.strength import POWERS, Bounds, Candidate, Merger, MergingCosts
@@ -40,10 +39,10 @@ COARSE_COSTS = 3.0
 # 5 dB by it; two captures and three other scenes keep 2.1 times as many and more, and the captures' starts would lose 0.7 to 2 dB.
 FAR_FEWER, REACHED = 1 / 4, 1.5
 
-# Where more than this part of the splats become too faint to be drawn, opacities are also matched in one round, or in none, where they are told by
+# Where more than this part of the splats become too faint to be drawn, opacities are also matched in one sweep, or in none, where they are told by
 # this power of areas: what is not drawn has no weight, and is raised until all together hide several times too much. Four objects gain 0 to 4 dB
 # by it at x1/16, 1 to 8 at x1/32 and 5 to 11 at x1/64, two captures nothing.
-FAINT, FEWER = 0.1, ((1, AREA_POWER), (0, 1.0), (0, AREA_POWER))
+FAINT, FEWER = 0.1, (((1,), AREA_POWER), ((), 1.0), ((), AREA_POWER))
 
 # The budget is long enough for a search if that is expected to end within this part of the start's time; whole runs need less of it.
 SEARCH_PART = 1 / 4
@@ -133,27 +132,27 @@ class StartSearch:
         return formed, quality
 
     def _matched_as_shown(self, formed: SplatModel, quality: Quality, weights: Tensor | None) -> tuple[SplatModel, Quality]:
-        """The closed form, or with opacities matched in fewer or more rounds if no step follows and it looks better by that; and its quality."""
+        """The closed form, or with opacities matched in fewer or more sweeps if no step follows and it looks better by that; and its quality."""
         if self._learns or not self._forms or not self._matcher.is_of_use or weights is None:
             return formed, quality
         less, better = self._matched_less(formed, quality, weights)
         further, best = self._matched_further(formed, quality, weights, self._seen.whole_of_base, self._problem.base)
         if better.visible > best.visible:
             return less, better
-        self._matcher.rounds = ROUNDS if further is formed else 2 * ROUNDS  # of merged splats too
+        self._matcher.wanted = None if further is formed else (*self._matcher.sweeps.usual, *self._matcher.sweeps.further)  # of merged splats too
         return further, best
 
     def _matched_less(self, formed: SplatModel, quality: Quality, weights: Tensor) -> tuple[SplatModel, Quality]:
-        """The closed form, or with opacities matched in fewer rounds where many become too faint to be drawn, if it looks better; and its quality."""
+        """The closed form, or with opacities matched in fewer sweeps where many become too faint to be drawn, if it looks better; and its quality."""
         drawn, still_drawn = (self._drawn(model) for model in (self._problem.base(), formed))
         fewer = FEWER[:-1] if self._alike else FEWER  # the last is no closed form of a filter that draws alike
-        for rounds, power in fewer if (drawn & ~still_drawn).float().mean() > FAINT else ():
+        for sweeps, power in fewer if (drawn & ~still_drawn).float().mean() > FAINT else ():
             if self._clock.allows("candidate"):
-                self._matcher.rounds, self._power = rounds, power
+                self._matcher.wanted, self._power = sweeps, power
                 less = self._candidate(weights, 1.0)
                 if (better := self._problem.quality(less)).visible > quality.visible:
                     formed, quality = less, better
-        self._matcher.rounds, self._power = ROUNDS, AREA_POWER
+        self._matcher.wanted, self._power = None, AREA_POWER
         return formed, quality
 
     def _drawn(self, model: SplatModel) -> Tensor:
@@ -163,16 +162,16 @@ class StartSearch:
     def _matched_further(
         self, formed: SplatModel, quality: Quality, weights: Tensor, whole: Tensor, copied: Callable[[], SplatModel]
     ) -> tuple[SplatModel, Quality]:
-        """The closed form, or with opacities matched in as many rounds again if it looks better by that; and its quality.
+        """The closed form, or with opacities matched in further sweeps if it looks better by that; and its quality.
 
         `whole`: as of `Matcher.matched`; `copied`: makes a model of the same splats, whose scales and opacities may be others.
         """
-        problem = self._problem
-        if not self._clock.allows("weights", ROUNDS):
+        problem, sweeps = self._problem, self._matcher.sweeps.further
+        if not self._clock.allows("weights", len(sweeps)):
             return formed, quality
         further, splats = copied(), formed.gaussians(problem.views[0]).detach()
         with problem.phase("closed form"):
-            reshape(further, lambda _: (splats.scales, self._matcher.matched(splats, weights, whole, ROUNDS)), problem.views)
+            reshape(further, lambda _: (splats.scales, self._matcher.matched(splats, weights, whole, sweeps)), problem.views)
         better = problem.quality(further)
         return (further, better) if better.visible > quality.visible else (formed, quality)
 
@@ -284,13 +283,13 @@ class StartSearch:
 
     def _closed_form(self, gaussians: Gaussians, weights: Tensor | None) -> tuple[Tensor, Tensor]:
         """Scales [N, 3] and opacities [N] in closed form, with opacities that match the blend weights where these are known."""
-        problem, rounds = self._problem, self._matcher.rounds_for(weights)
+        problem, sweeps = self._problem, self._matcher.sweeps_for(weights)
         pixel = self._seen.pixel_size(gaussians.means)
         formed_for = mean_pixel_size(gaussians.means, problem.closest_of, self._seen.count) if problem.scale > 1 else pixel
-        power = 1.0 if rounds else self._power
+        power = 1.0 if sweeps else self._power
         settings = FormSettings(power, self._crispness, self._seen.count, formed_for, matched=power == 1)
         scales, opacities = closed_form(gaussians, problem.views, problem.scale, problem.base_effects, problem.target, settings)
-        if weights is None or not rounds:
+        if weights is None or not sweeps:
             return scales, opacities
         formed = replace(gaussians, scales=scales, opacities=opacities)
-        return scales, self._matcher.matched(formed, weights, self._seen.whole(gaussians, pixel), rounds)
+        return scales, self._matcher.matched(formed, weights, self._seen.whole(gaussians, pixel), sweeps)

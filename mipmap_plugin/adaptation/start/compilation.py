@@ -34,7 +34,7 @@ def warm_up(backend: Any, gaussians: Gaussians, effects: Sequence[Effects], call
         image = backend.render(replace(few, means=few.means.clone().requires_grad_(calls.gradients)), ONE_PIXEL, setting).image
         if calls.merging and setting in kinds:  # here, because another process may be compiling the backward pass by now
             weights = blend_weights(few, [ONE_PIXEL], backend, setting)
-            merge(few, torch.ones_like(weights), weights, fraction=0.5)
+            merge(few, torch.ones_like(weights), weights[:, None], fraction=0.5)
             closed_form(few, [ONE_PIXEL], 0.5, effects[0], setting)
         if calls.gradients and image.requires_grad and not steps:
             image.sum().backward()

@@ -3,20 +3,29 @@
 A dilated splat covers a larger area, and the closed form lowers its opacity by the same factor; at zoom-in it raises it. But the coverage
 of overlapping splats is not the sum of their areas, and splats behind them shine through more. Both are corrected by measuring the blend
 weight of each splat in the target's images, and multiplying its opacity by the ratio of the wanted to the measured weight: iterative
-proportional fitting (Deming and Stephan 1940), damped where it overshoots.
+proportional fitting (Deming and Stephan 1940), damped where it overshoots. Opacities change after each part of the views, as in tomography
+(ordered subsets, Hudson and Larkin 1994, "Accelerated image reconstruction using ordered subsets of projection data"): once over the views in
+four parts comes as close as three times over all of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-# Iterations. Where no step follows, as many again are tried: captures gain up to 1.2 dB by them, lego 1.5.
-ROUNDS = 3
+from mipmap_plugin.camera import Camera
 
-# An opacity changes by at most this factor per iteration.
+# The most parts that views are divided in, of which part k has every PARTS-th view from the k-th on.
+PARTS = 4
+
+# A part has at least so many views and target pixels. With half as many views lego has 0.4 to 0.7 dB less at x1/4; with 864 pixels, for 39,000
+# splats, 0.8 dB at x1/16.
+PART_VIEWS, PART_PIXELS = 6, 10_000
+
+# An opacity changes by at most this factor per part.
 MAX_FACTOR = 4.0
 
 # Pixels: an invisible blend weight, added to keep ratios finite.
@@ -27,16 +36,40 @@ INVISIBLE_WEIGHT = 1e-4
 HARDLY_SEEN = 1e-3
 
 
-@torch.no_grad()
-def matched_opacities(opacities: Tensor, target: Tensor, whole: Tensor, weights_of: Callable[[Tensor], Tensor], rounds: int = ROUNDS) -> Tensor:
-    """Opacities [N] for which `weights_of(opacities)`, the mean blend weight [N] of each splat in pixels, is close to `target` [N].
+class Sweeps(NamedTuple):
+    """How often all views are looked at, and in how many parts (1, 2 or 4) each time."""
 
-    `whole` [N]: the weights of splats that nothing hides (`blend_weights.whole_weights`).
+    usual: tuple[int, ...]
+    further: tuple[int, ...]  # where no step follows: captures gain up to 1.2 dB by them, lego 1.1
+
+
+# By the number of parts that the views can be divided in.
+SWEEPS = {4: Sweeps((4,), (2, 1, 1)), 2: Sweeps((2, 2), (1, 1, 1)), 1: Sweeps((1, 1, 1), (1, 1, 1))}
+
+
+def sweeps_over(views: Sequence[Camera]) -> Sweeps:
+    """The sweeps over views of the target's scale."""
+    pixels = sum(view.width * view.height for view in views)
+    return next(sweeps for parts, sweeps in SWEEPS.items() if parts <= max(1, min(len(views) // PART_VIEWS, pixels // PART_PIXELS)))
+
+
+@torch.no_grad()
+def matched_opacities(
+    opacities: Tensor, wanted: Tensor, whole: Tensor, weights_of: Callable[[Tensor, int, int], Tensor], sweeps: Sequence[int]
+) -> Tensor:
+    """Opacities [N] with which splats have the `wanted` blend weights [N, P], pixels: what each of P parts of the views adds to the mean over all.
+
+    `weights_of(opacities, part, parts)` [N]: the same with these opacities, of every `parts`-th view from number `part` on. `whole` [N]: the weights
+    of splats that nothing hides (`blend_weights.whole_weights`). `sweeps`: divisors of P.
     """
     known, before = INVISIBLE_WEIGHT + HARDLY_SEEN * whole, None
-    for _ in range(rounds):
-        ratio = (target + known) / (weights_of(opacities) + known)
-        overshot = torch.zeros_like(ratio, dtype=torch.bool) if before is None else (ratio > 1) != (before > 1)
-        factor = torch.where(overshot, ratio.sqrt(), ratio).to(opacities)  # half of the way, as factors go
-        opacities, before = (opacities * factor.clamp(1 / MAX_FACTOR, MAX_FACTOR)).clamp_max(1), ratio
+    mean = wanted.sum(1) + known
+    for parts in sweeps:
+        for part in range(parts):
+            here = wanted[:, part::parts].sum(1) + known / parts
+            ratio = here / (weights_of(opacities, part, parts) + known / parts)
+            overshot = torch.zeros_like(ratio, dtype=torch.bool) if before is None else (ratio > 1) != (before > 1)
+            factor = torch.where(overshot, ratio.sqrt(), ratio)  # half of the way, as factors go: too far before, or other views say so
+            factor = factor ** (parts * here / mean).clamp_max(1)  # less of it where other parts show more of a splat
+            opacities, before = (opacities * factor.to(opacities).clamp(1 / MAX_FACTOR, MAX_FACTOR)).clamp_max(1), ratio
     return opacities

@@ -84,12 +84,13 @@ class MergingRounds:
 
 
 def merge(gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float, rounds: MergingRounds | None = None) -> tuple[Gaussians, Tensor]:
-    """Merge splats down to a `fraction` (0..1) of them; return them and their blend weights.
+    """Merge splats down to a `fraction` (0..1) of them; return them and their blend weights [M, P].
 
     Merging ends early when hardly any pairs are within `MAX_DISTANCE` and `MAX_COST`. `pixel` [N]: the size of a target pixel at each splat,
-    in world units. `weights` [N]: the blend weight of each splat, in target pixels of a view. `rounds`: of an earlier call for the same splats.
+    in world units. `weights` [N, P]: what each part of the views adds to the blend weight of each splat, in target pixels of a view. `rounds`: of
+    an earlier call for the same splats.
     """
-    splats, target_count = _Moments.of(gaussians, pixel, weights), max(1, math.floor(fraction * len(gaussians)))
+    splats, target_count = _Moments.of(gaussians, pixel, weights.sum(1)), max(1, math.floor(fraction * len(gaussians)))
     rows, old_weights, rounds = torch.arange(len(gaussians), device=weights.device), splats.weights, rounds or MergingRounds()
     for number in count_from():
         surplus = len(splats.weights) - target_count
@@ -98,7 +99,8 @@ def merge(gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float,
         merged = min(surplus, math.ceil(MERGED_PER_ROUND * len(pairs[0])))
         splats, new_rows = splats.merged(pairs[0][:merged], pairs[1][:merged])
         rows = new_rows[rows]
-    return splats.gaussians(gaussians, rows, old_weights), splats.weights
+    new_weights = weights.new_zeros(len(splats.weights), weights.shape[1]).index_add_(0, rows, weights)
+    return splats.gaussians(gaussians, rows, old_weights), new_weights
 
 
 def merge_seen(
@@ -115,14 +117,14 @@ def merge_down(gaussians: Gaussians, pixel_of: Callable[[Tensor], Tensor], weigh
     """Merge splats until there are at most `most`; return them and their blend weights.
 
     Where too few share a pixel, they are merged as at coarser and coarser scales; if too many are left at `COARSEST_MERGE`, those of the
-    least blend weight are dropped. `pixel_of`: the size of a target pixel at means [N, 3], [N] in world units. `weights` [N]: as in `merge`.
+    least blend weight are dropped. `pixel_of`: the size of a target pixel at means [N, 3], [N] in world units. `weights` [N, P]: as in `merge`.
     """
     coarser = 1.0
     while len(gaussians) > most and coarser <= COARSEST_MERGE:
         gaussians, seen = merge(gaussians, coarser * pixel_of(gaussians.means), weights / coarser**2, (most + 0.5) / len(gaussians))
         weights, coarser = seen * coarser**2, coarser * 2**0.5
     if len(gaussians) > most:
-        kept = weights.topk(most).indices.sort().values
+        kept = weights.sum(1).topk(most).indices.sort().values
         gaussians, weights = gaussians[kept], weights[kept]
     return gaussians, weights
 

@@ -41,7 +41,7 @@ def coarsened(
     still, moved = splats[~changes], splats[changes]
     if weights is not None and kept < len(moved):
         in_pixels = weights[changes] * (pixels[changes] / coarser).square()
-        moved, _ = merge(moved, torch.full_like(in_pixels, coarser), in_pixels, kept / len(moved))
+        moved, _ = merge(moved, torch.full_like(in_pixels, coarser), in_pixels[:, None], kept / len(moved))
     scales, opacities = shaped(moved, pixel_of(moved.means).clamp(finer, coarser), coarser, target)
     return still.joined(replace(moved, scales=scales, opacities=opacities)), len(still)
 

@@ -11,7 +11,7 @@ from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.candidates import StartSearch
 from mipmap_plugin.adaptation.start.clock import Clock
 from mipmap_plugin.adaptation.start.matcher import UNMATCHED
-from mipmap_plugin.adaptation.start.matching import MAX_FACTOR, ROUNDS, matched_opacities
+from mipmap_plugin.adaptation.start.matching import MAX_FACTOR, PART_PIXELS, SWEEPS, matched_opacities, sweeps_over
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -36,6 +36,8 @@ def weigh(opacities: torch.Tensor) -> torch.Tensor:
 
 HALF = torch.tensor([PIXELS / 2, PIXELS / 4], dtype=torch.float64)  # px: of two walls that cover half of what they are before
 
+WHOLE = SWEEPS[1].usual  # three times over all views
+
 NOTHING = torch.zeros(2)  # of splats that are seen as a whole, whatever that is
 
 
@@ -45,49 +47,80 @@ def test_the_weights_of_two_walls_are_known():
 
 @pytest.mark.parametrize("opacities", [(0.9, 0.9), (0.8, 0.2), (0.3, 0.3), (0.3, 0.9)])
 def test_opacities_become_those_that_were_wanted(opacities):
-    new = matched_opacities(torch.tensor(opacities, dtype=torch.float64), HALF, NOTHING, weigh)
+    new = matched(torch.tensor(opacities, dtype=torch.float64), HALF, NOTHING, weigh)
     torch.testing.assert_close(new, torch.full_like(new, 0.5), rtol=1e-3, atol=0)
 
 
 def test_every_round_comes_closer():
     tried = []
-    matched_opacities(torch.tensor([0.95, 0.05], dtype=torch.float64), HALF, NOTHING, lambda opacities: tried.append(opacities) or weigh(opacities))
+    matched(torch.tensor([0.95, 0.05], dtype=torch.float64), HALF, NOTHING, lambda opacities: tried.append(opacities) or weigh(opacities))
     far = [float((weigh(each) - HALF).abs().sum()) for each in tried]
-    assert len(far) == ROUNDS and far == sorted(far, reverse=True)
+    assert len(far) == len(WHOLE) and far == sorted(far, reverse=True)
 
 
 def test_no_opacity_rises_above_one():
-    new = matched_opacities(torch.tensor([0.5, 0.5], dtype=torch.float64), 10 * HALF, NOTHING, weigh)
+    new = matched(torch.tensor([0.5, 0.5], dtype=torch.float64), 10 * HALF, NOTHING, weigh)
     assert (new == 1).all()
 
 
 def test_an_opacity_that_overshot_goes_half_of_the_way_back():
     """Of a weight that is the square of the opacity: a ratio of 4 leads from 0.25 to 1, a ratio of 1/4 from there to 0.5, which is right."""
-    new = matched_opacities(torch.tensor([0.25]), torch.tensor([0.25]), NOTHING[:1], lambda opacities: opacities**2, rounds=2)
+    new = matched(torch.tensor([0.25]), torch.tensor([0.25]), NOTHING[:1], lambda opacities: opacities**2, (1, 1))
     assert new.item() == pytest.approx(0.5, rel=1e-2)
 
 
 def test_unseen_splats_stay_as_they_are():
     opacities = torch.tensor([0.3, 0.0])
-    assert torch.equal(matched_opacities(opacities, torch.zeros(2), NOTHING, torch.zeros_like), opacities)
+    assert torch.equal(matched(opacities, torch.zeros(2), NOTHING, torch.zeros_like), opacities)
 
 
 def test_what_is_wanted_of_the_unseen_and_what_nobody_wants_stay_finite():
     wanted, found = torch.tensor([9.0, 0.0]), torch.tensor([0.0, 9.0])
-    unseen, unwanted = matched_opacities(torch.tensor([1e-6, 0.5]), wanted, NOTHING, lambda tried: found).tolist()
-    assert unseen == pytest.approx(1e-6 * MAX_FACTOR**ROUNDS) and unwanted == pytest.approx(0.5 / MAX_FACTOR**ROUNDS)
+    unseen, unwanted = matched(torch.tensor([1e-6, 0.5]), wanted, NOTHING, lambda tried: found).tolist()
+    assert unseen == pytest.approx(1e-6 * MAX_FACTOR ** len(WHOLE)) and unwanted == pytest.approx(0.5 / MAX_FACTOR ** len(WHOLE))
 
 
 def test_nothing_changes_where_weights_match():
     opacities = torch.tensor([0.7, 0.2], dtype=torch.float64)
-    torch.testing.assert_close(matched_opacities(opacities, weigh(opacities), NOTHING, weigh), opacities, rtol=1e-9, atol=0)
+    torch.testing.assert_close(matched(opacities, weigh(opacities), NOTHING, weigh), opacities, rtol=1e-9, atol=0)
 
 
 def test_what_hardly_shows_of_a_splat_says_little_of_its_opacity():
-    """Of 1,000 px one tenth shows, and a fifth is wanted: the sight of both changes the opacity by a tenth a round."""
+    """Of 1,000 px one tenth shows, and a fifth is wanted: the sight of both changes the opacity by a tenth each time."""
     opacities, whole = torch.tensor([0.3]), torch.tensor([1000.0])
-    new = matched_opacities(opacities, torch.tensor([0.2]), whole, lambda tried: torch.tensor([0.1]))
-    assert new.item() == pytest.approx(0.3 * (1.2 / 1.1) ** ROUNDS, rel=1e-3)
+    new = matched(opacities, torch.tensor([0.2]), whole, lambda tried: torch.tensor([0.1]))
+    assert new.item() == pytest.approx(0.3 * (1.2 / 1.1) ** len(WHOLE), rel=1e-3)
+
+
+def test_opacities_change_after_each_part_of_the_views():
+    """Of a splat that is twice too faint in all views, the first part says so, and the second finds it right."""
+    tried = []
+
+    def weights_of(opacities, part, parts):
+        tried.append((part, parts, *opacities.tolist()))
+        return opacities / parts
+
+    new = matched_opacities(torch.tensor([0.2]), torch.tensor([[0.2, 0.2]]), NOTHING[:1], weights_of, (2,))
+    assert tried == [(0, 2, pytest.approx(0.2)), (1, 2, pytest.approx(0.4, rel=1e-2))] and new.item() == pytest.approx(0.4, rel=1e-2)
+
+
+def test_a_part_that_shows_less_of_a_splat_than_the_others_moves_it_less():
+    """It wants four times of what it sees, and has a tenth of what both parts want."""
+    seen = torch.tensor([[0.025], [0.9]])
+    new = matched_opacities(torch.tensor([0.1]), torch.tensor([[0.1, 0.9]]), NOTHING[:1], lambda _, part, parts: seen[part], (2,))
+    assert new.item() == pytest.approx(0.1 * 4 ** (2 * 0.1), rel=1e-2)
+
+
+@pytest.mark.parametrize(("views", "width", "parts"), [(24, 100, 4), (23, 100, 2), (12, 100, 2), (11, 100, 1), (24, 20, 1), (100, 20, 4)])
+def test_parts_have_some_views_and_some_thousand_pixels(views, width, parts):
+    camera = Camera(width, width, 10.0, 10.0, width / 2, width / 2, torch.eye(4))
+    assert sweeps_over(views * [camera]) == SWEEPS[parts]
+    assert parts == 1 or views * width**2 // parts >= PART_PIXELS
+
+
+def matched(opacities, wanted, whole, weigh, sweeps=WHOLE):
+    """`matched_opacities` for views that are looked at all together."""
+    return matched_opacities(opacities, wanted[:, None], whole, lambda tried, part, parts: weigh(tried), sweeps)
 
 
 @pytest.mark.parametrize("settings", [{}, {"most_splats": 20}], ids=["all splats", "merged ones"])
@@ -98,18 +131,18 @@ def test_without_steps_opacities_are_matched_once_more_and_kept_if_that_looks_be
     torch.testing.assert_close(opacities_by(monkeypatch, base, factors, **settings), right)
 
 
-@pytest.mark.parametrize(("factor", "asked"), [(1.0, [ROUNDS, ROUNDS]), (1e-4, [ROUNDS, 1, ROUNDS])], ids=["visible", "faint"])
-def test_without_steps_opacities_that_come_out_too_faint_are_matched_in_fewer_rounds(monkeypatch, factor, asked):
-    """None of these is drawn, which looks worse than with 1 round; with none they are the closed form's, which is not matched."""
-    base, rounds = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference"), []
+@pytest.mark.parametrize(("factor", "asked"), [(1.0, [WHOLE, WHOLE]), (1e-4, [WHOLE, (1,), WHOLE])], ids=["visible", "faint"])
+def test_without_steps_opacities_that_come_out_too_faint_are_matched_in_fewer_sweeps(monkeypatch, factor, asked):
+    """None of these is drawn, which looks worse than with one sweep; with none they are the closed form's, which is not matched."""
+    base, swept = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference"), []
 
-    def matched(opacities, target, whole, weights_of, count):
-        rounds.append(count)
-        return opacities * (factor if count == ROUNDS else 1)
+    def matched(opacities, wanted, whole, weights_of, sweeps):
+        swept.append(sweeps)
+        return opacities * (factor if sweeps == WHOLE else 1)
 
     monkeypatch.setattr(matcher, "matched_opacities", matched)
     found = base.adapt(1 / 4, recipe="instant", merge_to=1.0).model.gaussians(tiny.cameras()[0]).opacities
-    assert rounds == asked and found.mean() > 1e-2
+    assert swept == asked and found.mean() > 1e-2
 
 
 @pytest.mark.parametrize(("screen_filter", "count"), [("classic", 4), ("antialiased", 3)])

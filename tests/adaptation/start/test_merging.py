@@ -34,7 +34,7 @@ def covariances(gaussians: Gaussians) -> torch.Tensor:
 def merged(gaussians: Gaussians, share: float, pixel: float = 1.0, light: torch.Tensor | None = None) -> Gaussians:
     """All splats show as much, if nothing else is said."""
     ones = torch.ones(len(gaussians))
-    return merge(gaussians, pixel * ones, 0.01 * ones if light is None else light, share)[0]
+    return merge(gaussians, pixel * ones, (0.01 * ones if light is None else light)[:, None], share)[0]
 
 
 def test_a_pair_becomes_its_weight_mean_and_covariance():
