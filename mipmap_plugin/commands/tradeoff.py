@@ -84,10 +84,8 @@ def tradeoff(
     base = Base(checkpoint, cameras, background, screen_filter=screen_filter, up=up)
     model, photographs = wrap(base, threads), scene(base, images) if images else None
     _check(model, plan, scale)
-    if page:
-        folder = replace(folder, page=partial(write_tradeoff_page, page, checkpoint, model, overwrite))
     with resumable(output / KEPT, "cell"):
-        tradeoffs = run(model, photographs, unique_scales(scale), plan, views, folder)
+        tradeoffs = run(model, photographs, unique_scales(scale), plan, views, _with_page(folder, page, checkpoint, model))
     _print(tradeoffs, folder, page, json)
 
 
@@ -97,6 +95,10 @@ def _outputs(output: Path, picture: bool, report: bool, overwrite: bool) -> tupl
 
     refuse(folder := Folder(folder_of_several(output, (".json", ".csv", ".png", ".html")), picture, overwrite))
     return folder, tradeoff_page_path(output, overwrite) if report else None
+
+
+def _with_page(folder: Folder, page: Path | None, checkpoint: Path, model: Wrapped) -> Folder:
+    return folder if page is None else replace(folder, page=partial(write_tradeoff_page, page, checkpoint, model, folder.overwrite))
 
 
 def _check(model: Wrapped, plan: Plan, scales: Sequence[float]) -> None:
