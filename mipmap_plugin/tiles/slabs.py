@@ -77,14 +77,14 @@ class Painter:
         """The picture [H, W, 3] of all splats in front of the background."""
         return self.draw(splats, camera).over(torch.tensor(self.effects.background))
 
-    def weighed(self, splats: Splats, cameras: Sequence[Camera]) -> tuple[Tensor, float]:
+    def weighed(self, splats: Splats, cameras: Sequence[Camera], parts: Sequence[int]) -> tuple[Tensor, float]:
         """`blend_weights.weighed` of splats on the disk: blend weights [N, P], px, and the fraction of the splats that a view shows."""
         total, shown = torch.zeros(PARTS, len(splats)), 0.0
-        for number, view in enumerate(cameras):
+        for part, view in zip(parts, cameras, strict=True):
             weights = torch.zeros(len(splats))
             for strip in strips(view):
                 self._weigh(splats, strip, weights)
-            total[number % PARTS] += weights / len(cameras)
+            total[part] += weights / len(cameras)
             shown += float((weights > SHOWN).float().mean()) / len(cameras)
         return total.T, shown
 

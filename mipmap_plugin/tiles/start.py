@@ -10,16 +10,16 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.validation import Quality
-from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS, pixel_size, views_for
+from mipmap_plugin.adaptation.pixel_size import pixel_size
 from mipmap_plugin.adaptation.report import AS_IT_IS
-from mipmap_plugin.adaptation.start.base_weights import note_on_hidden
+from mipmap_plugin.adaptation.start.base_weights import note_on_hidden, weighed_in_parts
 from mipmap_plugin.adaptation.start.blend_weights import may_show, whole_weights
 from mipmap_plugin.adaptation.start.candidates import start_name
 from mipmap_plugin.adaptation.start.closed_form import FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import matched_opacities, sweeps_over
 from mipmap_plugin.adaptation.start.merging import merge_down, merge_seen
 from mipmap_plugin.adaptation.start.strength import Bounds, Candidate, Merger, MergingCosts
-from mipmap_plugin.camera import Camera, evenly
+from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.gaussians import Gaussians
@@ -71,11 +71,9 @@ class StartSearch:
         But always in views of their own size (`base_weights.HALF`).
         """
         scene, painter = self.scene, self.scene.painter(self.scene.base_effects)
-        first = evenly(scene.views.adapted, LEAST_VIEWS)
-        weights, shown = painter.weighed(scene.base, first)
-        if further := [view for view in evenly(scene.views.adapted, views_for(shown)) if view not in first]:
-            weights = weights.lerp(painter.weighed(scene.base, further)[0], len(further) / (len(first) + len(further)))
-        self.views = [*first, *further]
+        views = scene.views.adapted
+        weights, numbers = weighed_in_parts(len(views), lambda some, parts: painter.weighed(scene.base, [views[number] for number in some], parts))
+        self.views = [views[number] for number in numbers]
         weights, opacities, self.shown = weights * scene.scale**2, [], []
         for core in scene.cores:
             gaussians = scene.base.gaussians(core, colored=False)
@@ -162,7 +160,7 @@ class StartSearch:
 
         def weights_of(opacities: Tensor, part: int, parts: int) -> Tensor:
             splats.opacities, some = opacities, views[part::parts]
-            return painter.weighed(splats, some)[0].sum(1) * (len(some) / len(views))
+            return painter.weighed(splats, some, [0] * len(some))[0][:, 0] * (len(some) / len(views))
 
         opacities = torch.cat([part.mapped()[0][:, -1] for part in splats.parts]).sigmoid()
         opacities = matched_opacities(opacities, wanted, whole, weights_of, sweeps_over(views).usual)

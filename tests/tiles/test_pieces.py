@@ -172,18 +172,18 @@ def test_slabs_give_the_blend_weights_of_all_splats(on_disk, monkeypatch, backen
     splats, in_memory = on_disk
     views, backend = tiny.cameras(3), get_backend(backend)
     monkeypatch.setattr(slabs, "COLORLESS_SLAB", 37)
-    expected, shown = weighed(in_memory, views, backend, EFFECTS)
-    found = Painter(backend, EFFECTS).weighed(splats, views)
+    expected, shown = weighed(in_memory, views, [0, 3, 0], backend, EFFECTS)
+    found = Painter(backend, EFFECTS).weighed(splats, views, [0, 3, 0])
     assert torch.allclose(found[0], expected, atol=1e-3, rtol=1e-3) and found[1] == pytest.approx(shown)
 
 
 def test_strips_give_the_blend_weights_of_their_view(on_disk, monkeypatch):
     splats, _ = on_disk
     view, painter = tiny.cameras(1), Painter(ReferenceBackend(), EFFECTS)
-    whole, _ = painter.weighed(splats, view)
+    whole, _ = painter.weighed(splats, view, [0])
     monkeypatch.setattr(slabs, "MOST_PIXELS", 300)
     assert [strip.height for strip in slabs.strips(view[0])] == [8, 8, 8]
-    assert torch.allclose(painter.weighed(splats, view)[0], whole, atol=0.02, rtol=0.01)  # the frame limits how oblique a splat may be drawn
+    assert torch.allclose(painter.weighed(splats, view, [0])[0], whole, atol=0.02, rtol=0.01)  # the frame limits how oblique a splat may be drawn
 
 
 @pytest.mark.parametrize(

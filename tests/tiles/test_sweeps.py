@@ -13,6 +13,7 @@ from cut_scenes import config, cut_in_three
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, TIE_DB, Quality
 from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS
 from mipmap_plugin.adaptation.schedule import ViewSchedule
+from mipmap_plugin.adaptation.start.matching import PARTS
 from mipmap_plugin.adaptation.start.strength import Merger
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.models.base import TrainedScale
@@ -92,7 +93,8 @@ def test_what_is_in_the_picture_but_not_seen_is_weighed_in_more_views(job):
     search = StartSearch(cut_in_three(replace(job, base=Base(folder))))
     search.run()
     assert len(search.views) == 2 * LEAST_VIEWS
-    whole, _ = search.scene.painter(search.scene.base_effects).weighed(search.scene.base, search.views)
+    parts = [place % PARTS for place in range(len(search.views))]
+    whole, _ = search.scene.painter(search.scene.base_effects).weighed(search.scene.base, search.views, parts)
     torch.testing.assert_close(search._measured(), whole * search.scene.scale**2)
 
 

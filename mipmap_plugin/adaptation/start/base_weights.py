@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -10,6 +10,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS, pixel_size, views_for
 from mipmap_plugin.adaptation.start.blend_weights import may_show, weighed, whole_weights
 from mipmap_plugin.adaptation.start.clock import Clock
+from mipmap_plugin.adaptation.start.matching import PARTS
 from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.gaussians import Gaussians
@@ -31,7 +32,7 @@ class BaseWeights:
         self._problem, self._clock = problem, clock
         self._of_base: tuple[Tensor, Tensor] | None = None  # the base's means and its pixel size
         self.count: int | None = None  # of the views that show enough of the splats; None as long as it is not known
-        self.views: list[Camera] = []  # these views, in the order in which they were weighed
+        self.views: list[Camera] = []  # these views
         self.size = 1.0  # fraction of their size at which views are weighed: `HALF`, or less where a time budget leaves no time for large ones
         self.shown = torch.empty(0, dtype=torch.bool)  # which splats views show (`may_show`)
         self.whole_of_base = torch.empty(0)  # the base's splats' weights if nothing hid them (`whole_weights`)
@@ -41,24 +42,24 @@ class BaseWeights:
         """[N, P]: the blend weights of the base's splats (`weighed`), in target pixels of a view, from as many views as show enough of them."""
         problem, gaussians = self._problem, base.gaussians(self._problem.views[0]).detach()
 
-        def over(numbers: Sequence[int], size: float) -> tuple[Tensor, float]:
-            return weighed(gaussians, [problem.views[number] for number in numbers], problem.backend, problem.base_effects, size)
+        def over(numbers: Sequence[int], parts: Sequence[int], size: float) -> tuple[Tensor, float]:
+            return weighed(gaussians, [problem.views[number] for number in numbers], parts, problem.backend, problem.base_effects, size)
 
-        all_views = range(len(problem.views))
-        first = evenly(all_views, LEAST_VIEWS)
-        self.size = self._clock.size(problem.views[0], LEAST_VIEWS, lambda size: over([0], size), HALF if problem.scale <= FAR else 1.0)
-        with self._clock.timing("weights"):
-            weights, shown = over(first, self.size)
-        self.count = views_for(shown)
-        while self.count > LEAST_VIEWS and not self._clock.allows("weights", self.count / LEAST_VIEWS - 1):
-            self.count //= 2
-        if further := [number for number in evenly(all_views, self.count) if number not in first]:
-            part = len(further) / (len(first) + len(further))
-            with self._clock.timing("weights", part):
-                weights = weights.lerp(over(further, self.size)[0], part)
+        def timed(numbers: Sequence[int], parts: Sequence[int]) -> tuple[Tensor, float]:
+            with self._clock.timing("weights", len(numbers) / LEAST_VIEWS):
+                return over(numbers, parts, self.size)
+
+        def enough(shown: float) -> int:
+            self.count = views_for(shown)
+            while self.count > LEAST_VIEWS and not self._clock.allows("weights", self.count / LEAST_VIEWS - 1):
+                self.count //= 2
+            return self.count
+
+        self.size = self._clock.size(problem.views[0], LEAST_VIEWS, lambda size: over([0], [0], size), HALF if problem.scale <= FAR else 1.0)
+        weights, numbers = weighed_in_parts(len(problem.views), timed, enough)
+        self.views = [problem.views[number] for number in numbers]
         weights = weights * problem.scale**2
         self.whole_of_base = self.whole(gaussians, self.pixel_size(gaussians.means))
-        self.views = [problem.views[number] for number in (*first, *further)]
         self.shown = may_show(weights.sum(1), self.whole_of_base, gaussians.means, problem.views, self.views)
         self.notes += note_on_hidden(self.shown, gaussians.opacities)
         return weights
@@ -75,6 +76,27 @@ class BaseWeights:
         pixels = pixel_size(means, self._problem.closest_of, self.count)
         self._of_base = self._of_base or (means, pixels)
         return pixels
+
+
+def weighed_in_parts(
+    count: int, weigh: Callable[[Sequence[int], Sequence[int]], tuple[Tensor, float]], enough: Callable[[float], int] = views_for
+) -> tuple[Tensor, list[int]]:
+    """The blend weights [N, P] from as many of `count` views as show enough, and the numbers of these, of which every P-th one is in the same part.
+
+    `weigh(numbers, parts)`: `weighed` in some of the views. `enough(shown)`: how many views are enough if each shows this fraction of the splats.
+    """
+    first = evenly(range(count), LEAST_VIEWS)
+    weights, shown = weigh(first, [place % PARTS for place in range(len(first))])
+    numbers = evenly(range(count), enough(shown))
+    if len(numbers) % len(first):  # these are all, and the first ones are not evenly spread among them
+        numbers = [*first, *(number for number in numbers if number not in first)]
+    else:  # every so-manieth is one of the first
+        stride = len(numbers) // len(first)
+        weights = torch.zeros_like(weights).index_add_(1, torch.arange(PARTS, device=weights.device) * stride % PARTS, weights)
+    parts = {number: place % PARTS for place, number in enumerate(numbers) if number not in first}
+    if parts:
+        weights = weights.lerp(weigh([*parts], [*parts.values()])[0], len(parts) / len(numbers))
+    return weights, numbers
 
 
 def note_on_hidden(shown: Tensor, opacities: Tensor) -> list[str]:

@@ -37,17 +37,19 @@ def blend_weights(gaussians: Gaussians, views: Sequence[Camera], backend: Backen
     return total / len(views)
 
 
-def weighed(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects, size: float = 1.0) -> tuple[Tensor, float]:
-    """What each part of the views (`matching.PARTS`) adds to `blend_weights`, [N, P], and the fraction of the splats that a view shows.
+def weighed(
+    gaussians: Gaussians, views: Sequence[Camera], parts: Sequence[int], backend: Backend, effects: Effects, size: float = 1.0
+) -> tuple[Tensor, float]:
+    """What each part of the views adds to `blend_weights`, [N, P], and the fraction of the splats that a view shows.
 
-    That is the mean over `views`; what is hidden behind others does not count. `size`: a fraction of the views' own, at which they are drawn; the
-    dilation keeps its size in the world.
+    That is the mean over `views`; what is hidden behind others does not count. `parts`: the number of each view's part, below `matching.PARTS`.
+    `size`: a fraction of the views' own, at which they are drawn; the dilation keeps its size in the world.
     """
     total, shown = gaussians.opacities.new_zeros(PARTS, len(gaussians)), torch.zeros_like(gaussians.opacities)
     views = views if size == 1 else [view.zoomed(size) for view in views]
     effects = replace(effects, eps2d=effects.eps2d * size**2, settings=effects.settings.finer(size))
-    for number, weights in enumerate(chain.from_iterable(_of_views(gaussians, views, backend, effects))):
-        total[number % PARTS] += weights
+    for part, weights in zip(parts, chain.from_iterable(_of_views(gaussians, views, backend, effects)), strict=True):
+        total[part] += weights
         shown += weights > SHOWN * size**2
     return total.T / (len(views) * size**2), float(shown.mean()) / len(views)
 

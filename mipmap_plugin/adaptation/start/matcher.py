@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
+from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS
 from mipmap_plugin.adaptation.start.base_weights import BaseWeights
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.clock import Clock
@@ -43,11 +44,16 @@ class Matcher:
         if not self.is_of_use or weights is None:
             return ()
         sweeps = wanted = self.sweeps.usual if self.wanted is None else self.wanted
-        while sweeps and not self._clock.allows("weights", len(sweeps)):
+        while sweeps and not self.allows(weights, sweeps):
             sweeps = sweeps[:-1]
         if wanted and not sweeps and UNMATCHED not in self._seen.notes:
             self._seen.notes.append(UNMATCHED)
         return sweeps
+
+    def allows(self, weights: Tensor, sweeps: Sequence[int]) -> bool:
+        """Whether there is time for such sweeps over splats of these weights [N, P]: in less of it than the base's if these and pixels are fewer."""
+        share = max(len(weights) / len(self._seen.whole_of_base), (self._size / self._seen.size) ** 2)
+        return self._clock.allows("weights", share * len(sweeps) * len(self._seen.views) / LEAST_VIEWS)
 
     def matched(self, splats: Gaussians, weights: Tensor, whole: Tensor, sweeps: Sequence[int]) -> Tensor:
         """The opacities [N] of splats in closed form, for these blend weights [N, P]; `whole` [N]: those of the base if nothing hid it."""

@@ -96,9 +96,9 @@ def test_truths_that_are_used_next_are_drawn_in_one_call():
 
 def test_weights_of_several_views_are_the_same(monkeypatch):
     monkeypatch.setattr(weights, "together", lambda *_: 2)
-    splats, views, backend = tiny.gaussians(40), tiny.cameras(5), Together()
-    found, shown = weights.weighed(splats, views, backend, EFFECTS)
-    expected, expected_shown = weights.weighed(splats, views, ReferenceBackend(), EFFECTS)
+    splats, views, backend, parts = tiny.gaussians(40), tiny.cameras(5), Together(), [0, 1, 2, 3, 1]
+    found, shown = weights.weighed(splats, views, parts, backend, EFFECTS)
+    expected, expected_shown = weights.weighed(splats, views, parts, ReferenceBackend(), EFFECTS)
     torch.testing.assert_close(found, expected)
     assert shown == expected_shown and backend.calls == [2, 2, 1]
 

@@ -7,10 +7,12 @@ import pytest
 import torch
 from tiny import cameras, model
 
+from mipmap_plugin.adaptation.start.base_weights import weighed_in_parts
 from mipmap_plugin.adaptation.start.blend_weights import _color_gradient, blend_weights, may_show, weighed, whole_weights
+from mipmap_plugin.adaptation.start.matching import PARTS
 from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.reference import ReferenceBackend
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import USUAL, RenderSettings
@@ -39,8 +41,8 @@ def test_the_sum_of_blend_weights_is_what_the_background_lacks(backend):
 
 def test_blend_weights_are_the_same_in_smaller_views(backend):
     splats, views = model(60).gaussians().detach(), [view.zoomed(4) for view in cameras(3)]
-    whole, shown = weighed(splats, views, backend, Effects(1))
-    smaller, also_shown = weighed(splats, views, backend, Effects(1), size=1 / 4)
+    whole, shown = weighed(splats, views, [0, 1, 0], backend, Effects(1))
+    smaller, also_shown = weighed(splats, views, [0, 0, 0], backend, Effects(1), size=1 / 4)
     assert float((smaller - whole).sum(1).abs().sum() / whole.sum()) < 0.06 and also_shown == pytest.approx(shown, abs=0.05)
 
 
@@ -106,3 +108,19 @@ def test_weights_over_windows_are_found_from_gradients():
     assert get_backend("cpu").blend_weights(splats, views[0], Effects(1, "window")) is None
     windows, pixels = (blend_weights(splats, views, get_backend("cpu"), Effects(1, name)).sum() for name in ("window", "classic"))
     assert 0.5 * pixels < windows < pixels
+
+
+@pytest.mark.parametrize(("count", "enough"), [(1, 12), (5, 12), (12, 12), (60, 24), (60, 48), (36, 48), (30, 48)])
+def test_each_part_of_the_views_has_its_own_blend_weights(count, enough):
+    """Of as many splats as views, each of which one view shows: what it adds to the mean, in the part of this view."""
+
+    def weigh(numbers, parts):
+        weights = torch.zeros(count, PARTS)
+        weights[list(numbers), list(parts)] = 1 / len(numbers)
+        return weights, 1.0
+
+    weights, numbers = weighed_in_parts(count, weigh, lambda _: enough)
+    expected = torch.zeros(count, PARTS)
+    expected[numbers, [place % PARTS for place in range(len(numbers))]] = 1 / len(numbers)
+    assert sorted(numbers) == evenly(range(count), enough)
+    torch.testing.assert_close(weights, expected)

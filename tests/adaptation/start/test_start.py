@@ -14,8 +14,6 @@ from mipmap_plugin.adaptation.report import AS_IT_IS, UNCHANGED, Report
 from mipmap_plugin.adaptation.start import base_weights, candidates, compilation
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.closed_form import closed_form
-from mipmap_plugin.adaptation.start.matcher import Matcher
-from mipmap_plugin.adaptation.start.matching import PARTS
 from mipmap_plugin.backends.base import Calls
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
@@ -170,24 +168,3 @@ def test_a_start_is_computed_from_as_many_views_as_show_enough(monkeypatch):
     monkeypatch.setattr(base_weights, "weighed", weighed)
     wrap_model(tiny.model(COUNT), cameras=tiny.cameras(60)).adapt(SCALE, recipe="instant", extra_views=0)
     assert counts == [12, 36]  # the further ones of 48
-
-
-@pytest.mark.parametrize("count", [1, 5, 12, 30, 60])
-def test_each_part_of_the_views_has_its_own_blend_weights(monkeypatch, count):
-    """Those of every so-manieth view that it is matched in, as far as they add to the mean over all; in one go or in two."""
-    found, matched = [], Matcher.matched
-
-    def kept(self, splats, weights, *rest):
-        found.append((self._seen, weights))
-        return matched(self, splats, weights, *rest)
-
-    monkeypatch.setattr(Matcher, "matched", kept)
-    base = wrap_model(tiny.model(COUNT), cameras=tiny.cameras(count), backend="reference")
-    base.adapt(1 / 2, recipe="instant", extra_views=0, merge_to=1.0)
-    (seen, weights), *_ = found
-    for part in range(PARTS):
-        if views := seen.views[part::PARTS]:
-            expected = blend_weights(base.model.gaussians(views[0]).detach(), views, base.backend()[0], base.effects())
-            torch.testing.assert_close(weights[:, part], expected / 4 * len(views) / len(seen.views))
-        else:
-            assert not weights[:, part].any()
