@@ -76,7 +76,6 @@ def main(
             rows.append(adapted_row(variant, adapted, evaluator))
         text = f"## {name}: the `{recipe}` recipe on {base} at x{scale:g}\n\n{table(rows)}\n"
         print(text, flush=True)
-        output.mkdir(parents=True, exist_ok=True)
         with new_file(output / f"{base}_x{scale:g}_{name}.md", overwrite=True) as file:
             file.write_text(text)
 

@@ -17,7 +17,7 @@ from statistics import fmean
 import torch
 import tyro
 from captures import Views
-from rows import joined, write_table
+from rows import write_table
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation.curve import decibel
@@ -89,9 +89,7 @@ def main(
             for degree in DEGREES:
                 rows.append(measure(whole, name, degree, each))
                 print(*rows[-1].cells(), sep="  ", flush=True)
-    rows = joined(output / "bands.json", Row, rows, lambda row: (row.base, row.cut_to, row.scale))
-    rows.sort(key=lambda row: (BASES.index(row.base), row.cut_to, -row.scale))
-    write_table(output, "bands", INTRO, HEAD, rows)
+    write_table(output, "bands", INTRO, HEAD, rows, lambda row: (BASES.index(row.base), row.cut_to, -row.scale))
 
 
 if __name__ == "__main__":

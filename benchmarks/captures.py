@@ -19,7 +19,7 @@ from statistics import fmean
 import torch
 import tyro
 from made_captures import CAPTURES, Capture
-from rows import joined, write_table
+from rows import write_table
 from torch import Tensor
 
 from mipmap_plugin import Camera
@@ -119,9 +119,8 @@ def main(
         for each in scale or SCALES:
             rows += [measure(name, capture, each, number) for number in seed or (0,)]
             print(*rows[-1].cells(), rows[-1].returned, sep="  ", flush=True)
-    rows = joined(output / "captures.json", Row, rows, lambda row: (row.capture, row.scale, row.seed))
-    rows.sort(key=lambda row: (list(CAPTURES).index(row.capture), abs(math.log2(row.scale)), row.scale, row.seed))
-    write_table(output, "captures", INTRO, HEAD, rows)
+    order = lambda row: (list(CAPTURES).index(row.capture), abs(math.log2(row.scale)), row.scale, row.seed)  # noqa: E731
+    write_table(output, "captures", INTRO, HEAD, rows, order)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ import tyro
 from bases import photographs_of
 from captures import Views
 from made_captures import CAPTURES
-from rows import joined, write_table
+from rows import write_table
 
 from mipmap_plugin import Camera, wrap_model
 from mipmap_plugin.adaptation.curve import decibel
@@ -118,9 +118,7 @@ def main(
     torch.set_num_threads(1)
     names = [*BASES, *CAPTURES]
     rows = [row for name in only or (names if data else CAPTURES) for row in measure(name, data, viewer or VIEWERS, scale or SCALES)]
-    rows = joined(output / "conversion.json", Row, rows, lambda row: (row.scene, row.viewer, row.scale))
-    rows.sort(key=lambda row: (names.index(row.scene), row.viewer, row.scale))
-    write_table(output, "conversion", INTRO, HEAD, rows)
+    write_table(output, "conversion", INTRO, HEAD, rows, lambda row: (names.index(row.scene), row.viewer, row.scale))
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ from mipmap_plugin.models.moving.deformable import DeformNetwork
 from mipmap_plugin.models.moving.hexplane import HexPlane
 from mipmap_plugin.models.moving.model import MovingModel
 from mipmap_plugin.models.vanilla import VanillaModel
-from mipmap_plugin.splatting.rotations import rotations
+from mipmap_plugin.splatting.projection import covariances_of
 
 ANCHORS = 1_000  # of ten splats each
 
@@ -100,7 +100,7 @@ def pairs(bench: Bench, folder: Path) -> Iterator[Pair]:
     yield from _anchors(bench, folder)
     filtered = MipModel("mip", full, torch.full((len(full),), 0.005))
     yield Pair("3D filter", "Mip-Splatting", bench.draw(filtered.gaussians), bench.draw(full.gaussians), True)
-    with_covariances = bench.draw(lambda camera: _with_covariances(full.gaussians(camera)))
+    with_covariances = bench.draw(lambda camera: replace(splats := full.gaussians(camera), covariances=covariances_of(splats)))
     yield Pair("covariances", "given for the same splats", with_covariances, bench.draw(full.gaussians), False)
     classic = bench.draw(full.gaussians)
     yield Pair("compensation", "antialiased", bench.draw(full.gaussians, Effects(3, "antialiased")), classic, True)
@@ -136,11 +136,6 @@ def _fields(bench: Bench) -> Iterator[Pair]:
     canonical, unmoved = bench.model(), DeformNetwork(state)
     evaluated = bench.draw(lambda camera: moving.moved_to(unmoved, canonical, camera.time or 0.0))
     yield Pair("time", "a still scene of Deformable-3D-Gaussians", evaluated, bench.draw(MovingModel("", canonical, unmoved).gaussians), False)
-
-
-def _with_covariances(gaussians: Gaussians) -> Gaussians:
-    factors = rotations(gaussians.quats) * gaussians.scales[:, None, :]
-    return replace(gaussians, covariances=factors @ factors.mT)
 
 
 def _anchors(bench: Bench, folder: Path) -> Iterator[Pair]:

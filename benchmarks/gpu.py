@@ -25,8 +25,8 @@ import gpu_speed
 import gpu_views
 import torch
 import tyro
-from gpu_records import Failure
-from gpu_results import Bandwidth, Results, report
+from gpu_records import Bandwidth, Failure
+from gpu_results import Results, report
 from gpu_speed import MODES, Case, Mode
 from gpu_timing import copied_per_second
 from gpu_work import DONE, Work, carry_out

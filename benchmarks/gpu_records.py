@@ -10,6 +10,13 @@ from mipmap_plugin.backends.conformance import Outcome
 
 
 @dataclass(frozen=True)
+class Bandwidth:
+    """Of a copy within the device's memory, read and written."""
+
+    bytes_a_second: float
+
+
+@dataclass(frozen=True)
 class Speed:
     """One backend on one scene."""
 

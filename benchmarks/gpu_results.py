@@ -11,7 +11,7 @@ from pathlib import Path
 from textwrap import shorten
 from typing import Any
 
-from gpu_records import Adaptation, Checked, Failure, FirstUse, Kernel, Profile, Speed, Views
+from gpu_records import Adaptation, Bandwidth, Checked, Failure, FirstUse, Kernel, Profile, Speed, Views
 from gpu_tables import adaptation_table, conformance_table, first_use_table, profile_table, speed_table, views_table
 
 from mipmap_plugin.formats.atomic import write_json
@@ -31,13 +31,6 @@ KEYS = {
 
 # Characters of a reason: what a backend lacks for viewers is a long list.
 REASON = 200
-
-
-@dataclass(frozen=True)
-class Bandwidth:
-    """Of a copy within the device's memory, read and written."""
-
-    bytes_a_second: float
 
 
 @dataclass

@@ -253,7 +253,6 @@ def main(
         measure: Measure, and not only draw the strips of frames.
     """
     torch.set_num_threads(1)
-    (output / "levels").mkdir(parents=True, exist_ok=True)
     for path in only or BASES:
         base, name = wrap_model(data / "checkpoints" / path, threads=1), Path(path).name
         dolly = dolly_of(base, data / "images" / name.split("_")[0])

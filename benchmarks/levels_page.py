@@ -13,6 +13,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.plot import figure_class
 from mipmap_plugin.evaluation.report import markdown
 from mipmap_plugin.formats.atomic import new_file
+from mipmap_plugin.formats.images import in_8_bits
 
 INTRO = """# A dolly over a ladder of levels
 
@@ -86,7 +87,7 @@ def strip(path: Path, rows: Mapping[str, Sequence[Tensor]], zooms: Sequence[floa
         for column, (zoom, picture) in enumerate(zip(zooms, pictures, strict=True)):
             corner = column * (HEIGHT + 4), row * (HEIGHT + WORDS)
             pen.text((corner[0] + 2, corner[1] + 2), f"{name}, x1/{1 / zoom:g}" if zoom < 1 else f"{name}, x1", fill="black")
-            pixels = Image.fromarray((picture.clamp(0, 1).numpy() * 255).round().astype("uint8"))
+            pixels = Image.fromarray(in_8_bits(picture))
             sheet.paste(pixels.resize((HEIGHT, HEIGHT), Image.Resampling.NEAREST), (corner[0], corner[1] + WORDS))
     with new_file(path, overwrite=True) as temporary:
         sheet.save(temporary, format="PNG")

@@ -12,6 +12,7 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.evaluation.judged import JudgedView
 from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.formats.images import in_8_bits
 
 
 def photograph(shot: JudgedView, frame: Camera) -> Tensor:
@@ -22,7 +23,7 @@ def photograph(shot: JudgedView, frame: Camera) -> Tensor:
     whole, zoom = shot.photograph, frame.fx / shot.camera.fx
     beyond = [(pixels / (zoom * side) - 1) / 2 * length for pixels, side, length in zip(frame.size, shot.camera.size, whole.shape, strict=False)]
     rims = [max(0, math.ceil(each)) for each in beyond]  # px of the photograph, above and below, left and right
-    wide = np.pad((whole * 255).round().numpy().astype(np.uint8), [*((rim, rim) for rim in rims), (0, 0)], mode="edge")
+    wide = np.pad(in_8_bits(whole), [*((rim, rim) for rim in rims), (0, 0)], mode="edge")
     top, left = (rim - each for rim, each in zip(rims, beyond, strict=True))
     box = (left, top, wide.shape[1] - left, wide.shape[0] - top)
     small = Image.fromarray(wide).resize((frame.width, frame.height), Image.Resampling.BICUBIC, box=box)

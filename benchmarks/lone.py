@@ -18,7 +18,7 @@ from statistics import fmean
 import torch
 import tyro
 from captures import Views
-from rows import joined, write_table
+from rows import write_table
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation.curve import decibel
@@ -87,9 +87,7 @@ def main(
         for each in scale or SCALES:
             rows.append(measure(data / "checkpoints" / SCENES[name], name, each))
             print(*rows[-1].cells(), sep="  ", flush=True)
-    rows = joined(output / "lone.json", Row, rows, lambda row: (row.capture, row.scale))
-    rows.sort(key=lambda row: (list(SCENES).index(row.capture), -row.scale))
-    write_table(output, "lone", INTRO, HEAD, rows)
+    write_table(output, "lone", INTRO, HEAD, rows, lambda row: (list(SCENES).index(row.capture), -row.scale))
 
 
 if __name__ == "__main__":

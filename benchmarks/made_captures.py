@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 import torch
@@ -91,8 +92,7 @@ class Builder:
         self.add(means, np.full((count, 3), scale), turned, np.full(count, 0.9), np.broadcast_to(color, (count, 3)), view_dependence=0.002)
 
     def gaussians(self) -> Gaussians:
-        columns = ("means", "quats", "scales", "opacities", "sh")
-        return Gaussians(*(torch.cat([getattr(part, column) for part in self._parts]) for column in columns))
+        return reduce(Gaussians.joined, self._parts)
 
 
 def looking(eye: ArrayLike, target: ArrayLike, field_of_view: float = 60) -> Camera:

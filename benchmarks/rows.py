@@ -25,8 +25,10 @@ def joined(file: Path, kind: Callable[..., Measured], rows: Sequence[Measured], 
     return list({key(row): row for row in (*earlier(file, kind), *rows)}.values())
 
 
-def write_table(folder: Path, name: str, intro: str, head: Sequence[str], rows: Sequence[Any]) -> None:
-    """Print the table of rows, whose `cells()` are as `head`, and write it as NAME.md beside NAME.json."""
+def write_table(folder: Path, name: str, intro: str, head: Sequence[str], measured: Sequence[Any], order: Callable[[Any], Any]) -> None:
+    """Print the table of rows, whose `cells()` are as `head`, and write it as NAME.md beside NAME.json. Rows of earlier runs that were not measured
+    again are kept. `order`: the key by which rows are sorted, and by which they are told from one another."""
+    rows = sorted(joined(folder / f"{name}.json", type(measured[0]), measured, order), key=order)
     text = f"{intro}\n{markdown(head, [row.cells() for row in rows])}\n"
     print(f"\n{text}")
     with new_file(folder / f"{name}.md", overwrite=True) as file:

@@ -28,7 +28,7 @@ import tyro
 from rows import joined
 from workloads import split_into
 
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import OPENGL_TO_OPENCV
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.models.vanilla import VanillaModel
@@ -114,14 +114,10 @@ def photograph(scene: Path, count: int, folder: Path) -> None:
     folder.mkdir()
     for number, view in enumerate(wrapped.cameras[:: len(wrapped.cameras) // count][:count]):
         write_image(folder / f"{number}.png", wrapped.render(view).image)
-        frames.append({"file_path": f"{number}.png", "transform_matrix": opengl_pose(view)})
+        pose = torch.linalg.inv(view.viewmat) @ OPENGL_TO_OPENCV
+        frames.append({"file_path": f"{number}.png", "transform_matrix": pose.tolist()})
     lens = {"w": view.width, "h": view.height, "fl_x": view.fx, "fl_y": view.fy, "cx": view.cx, "cy": view.cy}
     (folder / "transforms_test.json").write_text(json.dumps({**lens, "frames": frames}))
-
-
-def opengl_pose(view: Camera) -> list[list[float]]:
-    """Camera to world, with y up and z backwards."""
-    return (torch.linalg.inv(view.viewmat.double()) @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))).tolist()
 
 
 def words(command: str, scene: Path, place: Path, steps: int | None) -> list[str]:

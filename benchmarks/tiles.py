@@ -24,6 +24,7 @@ from typing import Any
 
 import torch
 import tyro
+from rows import joined
 
 from mipmap_plugin import load_scene, wrap_model
 from mipmap_plugin.adaptation.adapted import render_model
@@ -96,10 +97,8 @@ def run(
         base = wrap_model(scene, cameras=None if cameras is None else load_scene(cameras), backend="cpu")
         row["splats"] = len(base.model.parameters()["means"])
         row |= compared(base, files, float(Fraction(scale)))
-    file = RESULTS / "tiles.json"
-    rows = json.loads(file.read_text()) if file.exists() else []
-    rows = [other for other in rows if (other["scene"], other["tiles"], other["steps"]) != (row["scene"], tiles, steps)] + [row]
-    write_json(file, rows, overwrite=True)
+    rows = joined(RESULTS / "tiles.json", dict, [row], lambda each: (each["scene"], each["tiles"], each["steps"]))
+    write_json(RESULTS / "tiles.json", rows, overwrite=True)
     (RESULTS / "tiles.md").write_text(page(rows), encoding="utf-8")
 
 

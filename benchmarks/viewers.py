@@ -17,7 +17,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
 
-import numpy as np
 import torch
 import tyro
 from bases import photographs_of
@@ -30,6 +29,8 @@ from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.evaluation.report import markdown
 from mipmap_plugin.formats.atomic import write_json
+from mipmap_plugin.formats.images import write_image
+from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.wrap import Wrapped
 
 BROWSER = Path(__file__).parents[1] / "tests" / "browser"
@@ -91,7 +92,7 @@ def decimated(how: str) -> Callable[[Work, str], Path | None]:
     def file(work: Work, viewer: str) -> Path | None:
         made = work.folder / f"{how}_{viewer}.ply"
         if work.scale != 1 and not made.exists():
-            tool, count = BROWSER / "node_modules" / ".bin" / "splat-transform", count_of(work.adapted(viewer, viewer=viewer))
+            tool, count = BROWSER / "node_modules" / ".bin" / "splat-transform", read_header(work.adapted(viewer, viewer=viewer)).vertex.count
             source = str(work.base.model.source)
             subprocess.run(["node", str(tool), "-q", "-g", "cpu", source, f"--{how}", str(count), str(made)], check=True)
         return made if work.scale != 1 else None
@@ -157,23 +158,17 @@ def rows_of_viewer(
             continue
         images = screenshots(browser.open(viewer, path), work, views)
         quality = fmean(psnr(image, truth) for image, truth in zip(images, truths, strict=True))
-        rows.append(Row(base, work.scale, viewer, name, count_of(path), quality))
+        rows.append(Row(base, work.scale, viewer, name, read_header(path).vertex.count, quality))
         print(rows[-1], flush=True)
         if (base, work.scale) == SHOWN[:2] and viewer in SHOWN_IN:
-            save(pictures / f"{viewer}_{name}.png", images[SHOWN[2]])
-            save(pictures / "truth.png", truths[SHOWN[2]])
+            write_image(pictures / f"{viewer}_{name}.png", images[SHOWN[2]], overwrite=True)
+            write_image(pictures / "truth.png", truths[SHOWN[2]], overwrite=True)
     return rows
 
 
 def screenshots(opened: Page, work: Work, views: Sequence[JudgedView]) -> list[torch.Tensor]:
     pictures = opened.draw([view.camera.zoomed(work.scale) for view in views], work.base.background)
     return [torch.from_numpy(picture) for picture in pictures]
-
-
-def count_of(ply: Path) -> int:
-    """The splats that a file's header declares."""
-    with ply.open("rb") as file:
-        return next(int(line.split()[2]) for line in file if line.startswith(b"element vertex"))
 
 
 def keep(file: Path, rows: Sequence[Row]) -> None:
@@ -223,10 +218,6 @@ def enlarged(picture: Path) -> Image.Image:
     """Pixel by pixel, as a screen shows it."""
     with Image.open(picture) as image:
         return image.resize((round(image.width * HEIGHT / image.height), HEIGHT), Image.Resampling.NEAREST)
-
-
-def save(file: Path, image: torch.Tensor) -> None:
-    Image.fromarray((image.clamp(0, 1).numpy() * 255).round().astype(np.uint8)).save(file)
 
 
 if __name__ == "__main__":

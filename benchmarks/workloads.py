@@ -137,10 +137,8 @@ def split_into(gaussians: Gaussians, count: int) -> Gaussians:
         shorter = halved.scales * torch.where(longest > 0, (1 - APART**2) ** 0.5, 1.0)
         along = (rotations(halved.quats) @ (APART * halved.scales * longest)[..., None])[..., 0]
         opacities = halved.opacities / (2 * (1 - APART**2) ** 0.5)
-        halves = [replace(halved, means=halved.means + side * along, scales=shorter, opacities=opacities) for side in (-1, 1)]
-        parts = [rest, *halves]
-        names = ("means", "quats", "scales", "opacities", "sh")
-        gaussians = Gaussians(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+        one, other = (replace(halved, means=halved.means + side * along, scales=shorter, opacities=opacities) for side in (-1, 1))
+        gaussians = rest.joined(one).joined(other)
     return gaussians
 
 

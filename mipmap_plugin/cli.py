@@ -179,6 +179,6 @@ def _show(text: str, said: set[str]) -> None:
 
 def _told(words: object) -> str:
     """A message with paths from the current folder, and archives in place of the temporary folders they were unpacked to, which are gone by then."""
-    from mipmap_plugin.models.zipped_folder import told
+    from mipmap_plugin.models.zipped_folder import with_archives_named
 
-    return told_from_here(told(words))
+    return told_from_here(with_archives_named(words))

@@ -8,7 +8,7 @@ from mipmap_plugin.camera import Camera, digest_of
 from mipmap_plugin.errors import MipmapPluginError, is_temporary, warn
 from mipmap_plugin.models.adapted_scale import report_beside
 from mipmap_plugin.models.inria_folder import read_options
-from mipmap_plugin.models.zipped_folder import opened, told
+from mipmap_plugin.models.zipped_folder import unzipped, with_archives_named
 from mipmap_plugin.scenes import Scene, cameras_in, load_scene, model_cameras
 
 # What is said where the cameras are gone, or are others by now.
@@ -31,7 +31,7 @@ def where(scene: Path | None, folder: Path | None) -> dict[str, str]:
     """
     read_from = scene or folder
     paths = {"scene": read_from, "options": folder}
-    places = {name: told(path.absolute()) for name, path in paths.items() if path is not None}
+    places = {name: with_archives_named(path.absolute()) for name, path in paths.items() if path is not None}
     return {} if read_from is None or any(map(is_temporary, places.values())) else places
 
 
@@ -47,8 +47,8 @@ def _of_base(source: Path | None) -> tuple[list[Camera] | Scene, dict[str, str]]
                 options = others.get("options")
             case _:
                 return None
-        folder = opened(Path(options)) if isinstance(options, str) else None
-        cfg, scene = read_options(folder)[0], opened(Path(place))
+        folder = unzipped(Path(options)) if isinstance(options, str) else None
+        cfg, scene = read_options(folder)[0], unzipped(Path(place))
         # Those of the base's own folder as it reads them, also where its options cannot be read.
         found = (scene == folder and model_cameras(folder, cfg)) or load_scene(scene, cfg)
         cameras = found.cameras if isinstance(found, Scene) else found

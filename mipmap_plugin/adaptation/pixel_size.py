@@ -11,7 +11,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.parallel import in_batches, in_chunks
 from mipmap_plugin.backends.cpu import finest_pixels
 from mipmap_plugin.camera import Camera, every_nth
-from mipmap_plugin.models.base import SplatModel, places
+from mipmap_plugin.models.base import SplatModel, means_at
 
 # Number of views from which the area and the blend weight of a splat are computed. It starts at LEAST_VIEWS and is doubled, up to MOST_VIEWS, until
 # a splat is in SEEN of them on average. Twelve suffice for an object, but would show only a third of the splats of a walk through nine rooms.
@@ -65,7 +65,7 @@ def pixel_size(means: Tensor, views: Sequence[Camera], count: int | None = None,
 
 def target_pixel(model: SplatModel, views: Sequence[Camera], scale: float) -> float:
     """The size of a pixel of the new scale at the median splat of a model, in world units; `views`: of the base scale."""
-    return float(pixel_size(places(model, views[0]), views).median()) / scale
+    return float(pixel_size(means_at(model, views[0]), views).median()) / scale
 
 
 def mean_pixel_size(means: Tensor, views: Sequence[Camera], count: int | None = None) -> Tensor:

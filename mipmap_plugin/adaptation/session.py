@@ -42,7 +42,7 @@ from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Calls
 from mipmap_plugin.camera import ONE_PIXEL, Camera, evenly
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.models.base import SplatModel, count_of, digest_of_model, places
+from mipmap_plugin.models.base import SplatModel, count_of, digest_of_model, means_at
 from mipmap_plugin.models.health import doubts_in
 from mipmap_plugin.process import pool, threads
 from mipmap_plugin.process.clock import now
@@ -91,7 +91,7 @@ class Session:
             chosen, note = choose_views(cameras, self.viewpoints, self.config)
             views, validation = split_validation(cameras, chosen, self.viewpoints, self.scale, self.config)
         note += f", {len(chosen) - len(views)} of them kept for validation" if len(views) < len(chosen) else ""
-        shown = showing(validation, places(self.base, chosen[0]), self.drawn.base.near_plane)
+        shown = showing(validation, means_at(self.base, chosen[0]), self.drawn.base.near_plane)
         if len(shown) > 1:  # one to steer by, and one to choose by; others are the same in every state
             validation = shown
         if self.base.traits.moves:

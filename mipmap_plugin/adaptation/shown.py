@@ -19,7 +19,7 @@ from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.errors import SettingsError, some_of
 from mipmap_plugin.formats.splat_transform import is_spz
 from mipmap_plugin.limits import check_image
-from mipmap_plugin.models.base import SplatModel, places
+from mipmap_plugin.models.base import SplatModel, means_at
 from mipmap_plugin.models.contract import row_opacities
 from mipmap_plugin.models.health import units
 from mipmap_plugin.progress import announced
@@ -122,7 +122,7 @@ def refuse_blind(views: Sequence[Camera], model: SplatModel, near: float, image_
 
     `near`: the near plane, in world units; `image_of`: a view's image [h, w, 3]; `scale`: the one adapted to, since a zoom-in makes specks large.
     """
-    some, means = evenly(views, LOOKED_AT), places(model, views[0])
+    some, means = evenly(views, LOOKED_AT), means_at(model, views[0])
     if not showing(some, means, near):  # a few of many cameras may see what is left of a scene that was cut down
         some = evenly(showing(views, means, near), LOOKED_AT) or some
     if any(_draws(view, model, near) for view in some):
@@ -140,7 +140,7 @@ def refuse_blind(views: Sequence[Camera], model: SplatModel, near: float, image_
 
 def _draws(view: Camera, model: SplatModel, near: float) -> bool:
     """Whether a row of the parameters that is opaque enough to be drawn lies in the view's picture, farther than the near plane."""
-    inside = view.in_picture(view.to_camera(places(model, view)), near)
+    inside = view.in_picture(view.to_camera(means_at(model, view)), near)
     return bool(inside.any()) and bool((row_opacities(model, [view])[inside] >= MIN_ALPHA).any())
 
 
@@ -250,6 +250,6 @@ def remarks(views: Sequence[Camera], model: SplatModel, near: float, *, orbit: b
     """What is wrong with a scene in views that show something, in sentences. `near`: the near plane, in world units; `orbit`: they were generated."""
     least = LEAST_SHARE * min(views[0].size)
     least = least if orbit else min(LEAST_PIXELS, least)
-    means = places(model, views[0])
+    means = means_at(model, views[0])
     found = too_near(views, means, near), too_small(views, model, near, least), far_apart(means) if orbit else ""
     return [sentence for sentence in found if sentence]

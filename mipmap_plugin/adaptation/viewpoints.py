@@ -18,7 +18,7 @@ from mipmap_plugin.camera import ONE_PIXEL, Camera, evenly
 from mipmap_plugin.effects import Effects, colorless
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.adapted_scale import adapted_orbit
-from mipmap_plugin.models.base import SplatModel, places
+from mipmap_plugin.models.base import SplatModel, means_at
 from mipmap_plugin.process.threads import side_by_side
 from mipmap_plugin.scenes.orbits import EVERY, Orbit, sharp_size
 from mipmap_plugin.scenes.photographed import sizes
@@ -149,4 +149,4 @@ def orbit_of(model: SplatModel, up: tuple[float, float, float] | None, means: Te
 def everywhere(model: SplatModel) -> Tensor:
     """Where the rows of a model's parameters are, [N, 3]; of one that moves at several moments, [M, 3]."""
     views = [replace(ONE_PIXEL, time=time) for time in MOMENTS] if model.traits.moves else [ONE_PIXEL]
-    return torch.cat([places(model, view) for view in views])
+    return torch.cat([means_at(model, view) for view in views])

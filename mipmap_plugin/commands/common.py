@@ -54,10 +54,10 @@ def wrap(base: Base, threads: int | None = None, images: Path | None = None) -> 
 
 def base_cameras(wrapped: Wrapped, given: Path | None) -> str:
     """Where the cameras were found, if they are those of the base of an adapted file; "" if they lay beside the file or in it, or were `given`."""
-    from mipmap_plugin.models.zipped_folder import told
+    from mipmap_plugin.models.zipped_folder import with_archives_named
 
     place = wrapped.cameras_from.get("scene", "")
-    own = [told(path.absolute()) for path in (wrapped.model.folder, wrapped.model.source) if path is not None]
+    own = [with_archives_named(path.absolute()) for path in (wrapped.model.folder, wrapped.model.source) if path is not None]
     return "" if given is not None or not place or place in own else from_here(Path(place))
 
 

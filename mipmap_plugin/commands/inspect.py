@@ -39,10 +39,10 @@ def inspect(
     """
     with announced(f"reading {checkpoint.name}"), uncollected():
         from mipmap_plugin.models import detect, load_model
-        from mipmap_plugin.models.zipped_folder import told
+        from mipmap_plugin.models.zipped_folder import with_archives_named
 
         found = detect(checkpoint, iteration=iteration)
-        known = {"file": told(found.path), "family": found.family}
+        known = {"file": with_archives_named(found.path), "family": found.family}
         if not json:
             print_facts(known)  # before torch is imported
         from mipmap_plugin.wrap import wrap_model

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TextIO
 
 from mipmap_plugin.errors import OutputError
-from mipmap_plugin.formats.atomic import refuse_named_pipe
+from mipmap_plugin.formats.nodes import refuse_named_pipe
 
 # How every line begins: by it a file is known to be a log, and not one that was named by mistake, such as a checkpoint.
 BEGINNING = re.compile(rb"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d ")

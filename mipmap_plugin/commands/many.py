@@ -87,7 +87,7 @@ def adapt_many(many: Many, given: Sequence[Path], request: Request, base: Base, 
     finally:  # a job that fails leaves a folder that another one was using
         remove_empty(sorted(missing, key=lambda folder: len(folder.parts), reverse=True))
     _print(outcomes, jobs, json)
-    if failed := [outcome for outcome in outcomes if outcome.status != "done" and outcome.status != "finished before"]:
+    if failed := [outcome for outcome in outcomes if outcome.status not in ("done", "finished before")]:
         raise JobsFailed(f"{len(failed)} of {plural(len(jobs), 'job')} failed; {again} does these again, and no other")
 
 

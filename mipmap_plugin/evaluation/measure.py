@@ -20,7 +20,7 @@ from mipmap_plugin.adaptation.views import extent
 from mipmap_plugin.adaptation.warn import silent
 from mipmap_plugin.backends import supersample
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.models.base import count_of, places
+from mipmap_plugin.models.base import count_of, means_at
 from mipmap_plugin.wrap import Wrapped
 
 RenderView = Callable[[Camera], Tensor]  # a camera of the base scale -> [h, w, 3]
@@ -142,7 +142,7 @@ def warm_stopwatch(show: RenderView, view: Camera) -> Stopwatch:
 def warm_up(model: Wrapped, scale: float, cameras: Sequence[Camera]) -> None:
     """Adapt one step on one view, so that compiling at first use is not counted in an adaptation; its warnings are of no use to anyone."""
     near = model.effects().near_plane
-    seeing = next(([view] for view in cameras if showing([view], places(model.model, view), near)), None)  # a single view of nothing would be refused
+    seeing = next(([view] for view in cameras if showing([view], means_at(model.model, view), near)), None)  # one of nothing would be refused
     with silent():
         model.adapt(scale, cameras=seeing, views="given" if seeing else "orbit", extra_views=1, steps=1, validation_views=2)
 

@@ -11,7 +11,7 @@ from mipmap_plugin.camera import evenly
 from mipmap_plugin.errors import plural
 from mipmap_plugin.evaluation.metrics import SAME_DB, psnr
 from mipmap_plugin.models.adapted_scale import adapted_scale
-from mipmap_plugin.models.base import places, why_no_viewer
+from mipmap_plugin.models.base import means_at, why_no_viewer
 from mipmap_plugin.wrap import Wrapped
 
 VIEWERS = ("spark", "playcanvas", "gaussian-splats-3d", "classic", "antialiased")
@@ -35,7 +35,7 @@ def viewer_differences(wrapped: Wrapped) -> str:
     if "reference" in (wrapped.backend()[0].name, wrapped.backend(viewer=VIEWERS[0])[0].name):
         return "not drawn: only the reference backend can, which takes too long; `mipmap-plugin backends` says what others lack"
     cameras = wrapped.views()
-    views = [view.zoomed(scale) for view in seeing(cameras, places(model, cameras[0]), wrapped.effects().near_plane)]
+    views = [view.zoomed(scale) for view in seeing(cameras, means_at(model, cameras[0]), wrapped.effects().near_plane)]
     count, pixels = len(model.gaussians(views[0])), views[0].width * views[0].height
     view_count = min(VIEWS, len(views), SPLATS // max(1, count), PIXELS // pixels)
     if view_count == 0:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.errors import MipmapPluginError, OutputError, OutputExists, of_system
+from mipmap_plugin.formats.nodes import kind_of_node
 from mipmap_plugin.formats.staging import Staging, missing_folders, remove_empty, settle
 
 # Files that operating systems leave in folders, and that may be deleted with them.
@@ -193,25 +194,6 @@ def delete(folder: Path) -> None:
         finally:
             staging.close()
     shutil.rmtree(folder, ignore_errors=True)
-
-
-def kind_of_node(status: os.stat_result) -> str:
-    """The kind of a path that is neither a regular file nor a folder."""
-    kinds = {stat.S_ISFIFO: "a pipe", stat.S_ISCHR: "a device", stat.S_ISBLK: "a device", stat.S_ISSOCK: "a socket"}
-    return next((name for test, name in kinds.items() if test(status.st_mode)), "no regular file")
-
-
-def no_file(path: Path) -> str:
-    """Why `path` cannot be read as a file, "" if it can: a pipe or a device may block forever."""
-    status = os.stat(path)
-    return "" if stat.S_ISREG(status.st_mode) else f"is {'a folder' if stat.S_ISDIR(status.st_mode) else kind_of_node(status)}, not a file"
-
-
-def refuse_named_pipe(path: Path) -> None:
-    """Raise OSError for a pipe with a name, which may block forever; one of the shell's, as in <(ls) and /dev/stdin, has its other end."""
-    real = Path(os.path.realpath(path))  # Path.resolve raises RuntimeError for a link to itself before Python 3.13
-    if real.is_fifo() and not real.is_relative_to("/dev"):  # where macOS has those of the shell, which Linux has nowhere
-        raise OSError(errno.EINVAL, "a pipe with a name, whose other end nobody may open", str(path))
 
 
 def _stat(path: Path) -> os.stat_result | None:

@@ -6,12 +6,11 @@ import zipfile
 import zlib
 from pathlib import Path
 
-from mipmap_plugin.formats.zipped import MOST_TIMES
+from mipmap_plugin.formats.magic import GZIP
+from mipmap_plugin.formats.zipped import MOST_TIMES, TOO_LARGE
 
-# How a gzip stream begins, and bytes of it that are unpacked at a time.
-GZIP, BLOCK = b"\x1f\x8b", 1 << 14
-
-TOO_LARGE = f"it would be more than {MOST_TIMES} times as large unpacked, which no file of splats is"
+# Bytes of a gzip stream that are unpacked at a time.
+BLOCK = 1 << 14
 
 
 def damage_of(path: Path) -> str:
@@ -25,7 +24,7 @@ def damage_of(path: Path) -> str:
             return _damage_of_gzip(path, most)
         with zipfile.ZipFile(path) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > most:
-                return TOO_LARGE
+                return f"it {TOO_LARGE}"
             wrong = archive.testzip()
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError) as error:
         return str(error)
@@ -42,7 +41,7 @@ def _damage_of_gzip(path: Path, most: int) -> str:
         while not stream.eof and (block := file.read(BLOCK)):
             size += len(stream.decompress(block))
             if size > most:
-                return TOO_LARGE
+                return f"it {TOO_LARGE}"
         rest = stream.unused_data + file.read(len(GZIP))
     if not stream.eof:
         return "it is cut off"

@@ -14,7 +14,8 @@ from PIL import ExifTags, Image
 from torch import Tensor
 
 from mipmap_plugin.errors import SceneError, SettingsError, ShapeError, brief
-from mipmap_plugin.formats.atomic import new_file, no_file
+from mipmap_plugin.formats.atomic import new_file
+from mipmap_plugin.formats.nodes import no_file
 from mipmap_plugin.limits import check_image
 
 # Pillow's modes for 16-bit gray. It reads 16-bit color as 8 bits, keeping the high byte.
@@ -125,16 +126,8 @@ def pillow_bicubic(image: Tensor, size: tuple[int, int]) -> Tensor:
     Differs from the same filter on floats: Pillow rounds and clamps to 8 bits between its two passes and after them.
     """
     height, width = size
-    small = Image.fromarray(_bytes(image)).resize((width, height), Image.Resampling.BICUBIC)
+    small = Image.fromarray(in_8_bits(image)).resize((width, height), Image.Resampling.BICUBIC)
     return torch.from_numpy(np.asarray(small).astype(np.float32)) / 255
-
-
-def is_file(path: Path) -> bool:
-    """Whether there is a file; False also for names that the system does not accept, which lists of images may contain."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
@@ -164,14 +157,14 @@ def write_image(path: str | Path, image: Tensor, *, overwrite: bool = False) -> 
     if not image.isfinite().all():
         raise SceneError(f"{path}: the image holds NaN or infinity and is not written; check the render that it came from")
     with new_file(path, overwrite) as temporary:
-        Image.fromarray(_bytes(image)).save(temporary, format="PNG")
+        Image.fromarray(in_8_bits(image)).save(temporary, format="PNG")
     return path
 
 
 def png(image: Tensor) -> bytes:
     """The PNG file of an image [H, W, 3], clamped to 0..1 and rounded to 8 bits."""
     file = io.BytesIO()
-    Image.fromarray(_bytes(image)).save(file, format="PNG", optimize=True)
+    Image.fromarray(in_8_bits(image)).save(file, format="PNG", optimize=True)
     return file.getvalue()
 
 
@@ -184,7 +177,7 @@ def lossless_webp(pixels: np.ndarray) -> bytes:
 
 def paletted(image: Tensor) -> tuple[np.ndarray, np.ndarray]:
     """An image [H, W, 3] as numbers of colors, [H, W], and these colors, at most 256, [C, 3] in 0..255; errors are spread over neighbors."""
-    quantized = Image.fromarray(_bytes(image)).quantize()
+    quantized = Image.fromarray(in_8_bits(image)).quantize()
     return np.asarray(quantized), np.asarray(quantized.getpalette()).reshape(-1, 3)
 
 
@@ -211,7 +204,8 @@ def write_array(path: Path, values: Tensor, *, overwrite: bool) -> None:
         np.save(file, values.detach().to("cpu", torch.float32).numpy())
 
 
-def _bytes(image: Tensor) -> np.ndarray:
+def in_8_bits(image: Tensor) -> np.ndarray:
+    """An image [H, W, 3], clamped to 0..1 and rounded, as uint8."""
     return (image.detach().to("cpu", torch.float32).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
 

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.errors import SceneError
-from mipmap_plugin.formats.atomic import no_file
 from mipmap_plugin.formats.magic import LFS_POINTER
+from mipmap_plugin.formats.nodes import no_file
 
 # px; an image of this width and height would take 120 GB.
 MAX_SIDE = 100_000

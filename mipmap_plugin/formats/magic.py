@@ -12,10 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from mipmap_plugin.errors import CheckpointError, brief
-from mipmap_plugin.formats.atomic import no_file
+from mipmap_plugin.formats.nodes import no_file
 
 # Beginning of a placeholder for a file that Git LFS has not fetched.
 LFS_POINTER = b"version https://git-lfs"
+
+# Beginning of a gzip stream, as SPZ is in its versions up to 3.
+GZIP = b"\x1f\x8b"
 
 # Bytes that are read to recognize a format; a .splat file has no magic number and is recognized by its first records.
 HEAD = 64 * 1024
@@ -62,7 +65,7 @@ def kind_of(path: Path) -> str:
     head = read_head(path)
     if re.match(rb"ply\s", head):
         return "ply"
-    if head.startswith(b"\x1f\x8b"):
+    if head.startswith(GZIP):
         return "spz" if _inflated(head) == b"NGSP" else "gzip"
     for magic, kind in {b"NGSP": "spz", b"glTF": "glb", b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19": "torch"}.items():
         if head.startswith(magic):

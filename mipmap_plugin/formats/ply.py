@@ -25,9 +25,9 @@ WRITTEN_TOGETHER = 1 << 16
 BYTE_ORDER = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 TYPES = {
-    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"},
-    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"},
-}
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -130,19 +130,25 @@ def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Ite
     path = Path(path)
     dtype = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
     count = len(next(iter(columns.values())))
-    declared = PlyElement.describe(np.broadcast_to(np.zeros((), dtype), (count,)), "vertex")
-    lines = [" ".join(text.splitlines()).encode("ascii", "backslashreplace").decode() for text in comments]
-    header = PlyData([declared], byte_order="<", comments=lines).header + "\n"
-    if len(header) >= MAX_HEADER:
-        raise SettingsError(f"{path}: comments and provenance take {len(header):,} bytes, but a PLY header holds {MAX_HEADER:,}; shorten them")
+    header = header_of_rows(path, dtype, count, comments)
     with new_file(path, overwrite) as temporary, temporary.open("xb") as file:
-        file.write(header.encode("ascii"))
+        file.write(header)
         for start in range(0, count, WRITTEN_TOGETHER):
             rows = np.empty(min(WRITTEN_TOGETHER, count - start), dtype)
             for name, column in columns.items():
                 rows[name] = column[start : start + WRITTEN_TOGETHER]
             file.write(rows.tobytes())
     return path
+
+
+def header_of_rows(path: Path, dtype: np.dtype, count: int, comments: Iterable[str]) -> bytes:
+    """The header of a binary PLY, little endian, of `count` rows of this type. Raises SettingsError, naming `path`, for comments that do not fit."""
+    declared = PlyElement.describe(np.broadcast_to(np.zeros((), dtype), (count,)), "vertex")
+    lines = [" ".join(text.splitlines()).encode("ascii", "backslashreplace").decode() for text in comments]
+    header: str = PlyData([declared], byte_order="<", comments=lines).header + "\n"
+    if len(header) >= MAX_HEADER:
+        raise SettingsError(f"{path}: comments and provenance take {len(header):,} bytes, but a PLY header holds {MAX_HEADER:,}; shorten them")
+    return header.encode("ascii")
 
 
 class _Fault(ValueError):

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import mmap
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
 from mipmap_plugin.errors import CheckpointError
-from mipmap_plugin.formats.ply import BYTE_ORDER, Header, read_header
+from mipmap_plugin.formats.atomic import new_file
+from mipmap_plugin.formats.ply import BYTE_ORDER, Header, header_of_rows, read_header
 
 # Bytes that are copied at a time.
 BLOCK = 1 << 22
@@ -49,24 +50,23 @@ def body_of(path: Path, header: Header) -> int:
     return header.body + sum(element.count * element.stride for element in before)
 
 
-def concatenate(files: Iterable[Path], comments: Iterable[str], out: IO[bytes]) -> int:
-    """Write a PLY of the vertex rows of `files`, one after the other, which have the same columns; return the number of rows.
+def concatenate(path: Path, files: Sequence[Path], comments: Iterable[str], *, overwrite: bool = False) -> Path:
+    """Write a PLY of the vertex rows of `files`, one after the other, which have the same columns; return its path. Atomic.
 
     The files are binary, little endian, and hold nothing behind these rows, as `write_ply` leaves them. Bytes are copied, and none is
-    parsed. Raises CheckpointError for files of different columns.
+    parsed. Raises CheckpointError for files of different columns, and what `write_ply` raises.
     """
-    paths = list(files)
-    headers = [read_header(path) for path in paths]
-    count, properties = sum(header.vertex.count for header in headers), headers[0].vertex.properties
-    for path, header in zip(paths, headers, strict=True):
-        if header.vertex.properties != properties or header.format != "binary_little_endian":
-            raise CheckpointError(f"{path} has other columns than {paths[0]}, so they are not parts of one scene; delete them to make them again")
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments), f"element vertex {count}"]
-    lines += [f"property {kind} {name}" for name, kind in properties]
-    out.write("\n".join([*lines, "end_header", ""]).encode("ascii", "backslashreplace"))
-    for path, header in zip(paths, headers, strict=True):
-        _copy(path, body_of(path, header), header.vertex.count * header.vertex.stride, out)
-    return count
+    headers = [read_header(file) for file in files]
+    count, first = sum(header.vertex.count for header in headers), headers[0].vertex
+    for file, header in zip(files, headers, strict=True):
+        if header.vertex.properties != first.properties or header.format != "binary_little_endian":
+            raise CheckpointError(f"{file} has other columns than {files[0]}, so they are not parts of one scene; delete them to make them again")
+    head = header_of_rows(path, first.dtype("<"), count, comments)
+    with new_file(path, overwrite) as temporary, temporary.open("xb") as out:
+        out.write(head)
+        for file, header in zip(files, headers, strict=True):
+            _copy(file, body_of(file, header), header.vertex.count * header.vertex.stride, out)
+    return path
 
 
 def _copy(path: Path, start: int, size: int, out: IO[bytes]) -> None:

@@ -59,9 +59,14 @@ INSTALL = "npm install -g @playcanvas/splat-transform"
 LONGEST = 1200
 
 
+def written_ending(path: Path) -> str:
+    """The suffix of the exchange format that is written to a path; "" for a path of anything else."""
+    return next((ending for ending in WRITTEN if path.name.lower().endswith(ending)), "")
+
+
 def is_written(path: Path) -> bool:
     """Whether a path has the suffix of an exchange format that can be written."""
-    return path.name.lower().endswith(WRITTEN)
+    return bool(written_ending(path))
 
 
 def refuse_exchange(path: Path) -> list[str]:
@@ -151,10 +156,9 @@ def write_exchange(path: Path, write: Callable[[Path], Any], *, overwrite: bool)
 
     tool = refuse_exchange(path)
     with tempfile.TemporaryDirectory(prefix=TEMPORARY) as folder, new_file(path, overwrite) as temporary:
-        ending = next(suffix for suffix in WRITTEN if path.name.lower().endswith(suffix))
-        plain, converted = Path(folder, "plain.ply"), Path(folder, f"made{ending}")
+        plain, converted = Path(folder, "plain.ply"), Path(folder, f"made{written_ending(path)}")
         write(plain)
-        if ending == ".sog":
+        if converted.suffix == ".sog":
             write_sog(converted, read_ply(plain).columns, antialiased=_mode(plain) == "antialiased")
         else:
             _convert(tool, plain, converted, path)
@@ -240,14 +244,9 @@ def _mode(file: Path, kind: str = "ply") -> str | None:
     return render_mode(read_header(file).comments)
 
 
-def is_glb(path: Path) -> bool:
-    """Whether a path is that of a binary glTF."""
-    return path.name.lower().endswith(".glb")
-
-
 def is_spz(path: Path) -> bool:
     """Whether a path is that of an SPZ."""
-    return path.name.lower().endswith(".spz")
+    return written_ending(path) == ".spz"
 
 
 def reason_in(said: str) -> str:

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from mipmap_plugin.formats.magic import GZIP
 from mipmap_plugin.formats.ply import read_ply, write_ply
 
-# The header: magic, version, splats, SH degree, bits of fractions, flags, and a byte that is reserved.
+# The header, inside the gzip: magic, version, splats, SH degree, bits of fractions, flags, and a byte that is reserved (nianticlabs/spz).
 HEADER = struct.Struct("<4sIIBBBB")
 
 # A coefficient c is stored as ZERO + ONE · c.
@@ -29,7 +30,7 @@ def refine(file: Path, columns: Mapping[str, np.ndarray]) -> None:
     Any other file is left as it is.
     """
     packed = file.read_bytes()
-    if not packed.startswith(b"\x1f\x8b"):
+    if not packed.startswith(GZIP):
         return
     content = gzip.decompress(packed)
     magic, version, count, degree, _, *flags = HEADER.unpack_from(content)

@@ -16,6 +16,7 @@ from mipmap_plugin.formats.magic import archive
 # How many times as large as its archive a PLY may be. Those of captures are less than twice as large, and one without view-dependent color, whose
 # columns are zeros, ten times; an archive that fills a disk has thousands.
 MOST_TIMES = 100
+TOO_LARGE = f"would be more than {MOST_TIMES} times as large unpacked, which no file of splats is"
 
 # Errors of a write if the disk, or the user's quota, is full.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -45,7 +46,7 @@ def unpacked(path: Path) -> Iterator[Path]:
 def refuse_large(path: Path, size: int, folder: Path) -> None:
     """Raise CheckpointError if `size` bytes of an archive are more than an honest one holds, or than there is room for in `folder`."""
     if size > MOST_TIMES * path.stat().st_size:
-        raise CheckpointError(f"{path} would be more than {MOST_TIMES} times as large unpacked, which no file of splats is; do not open it")
+        raise CheckpointError(f"{path} {TOO_LARGE}; do not open it")
     if size > shutil.disk_usage(folder).free:
         needed = f"{size / 2**30:,.1f} GiB"
         raise CheckpointError(f"{path} needs {needed} unpacked, for which {tempfile.gettempdir()} has no room; unpack it elsewhere")

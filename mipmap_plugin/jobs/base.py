@@ -55,10 +55,10 @@ class Base:
 
     def unpacked(self) -> Base:
         """The same checkpoint, for another process: this one removes what it unpacked when it ends, but a worker that is killed does not."""
-        from mipmap_plugin.models.zipped_folder import opened
+        from mipmap_plugin.models.zipped_folder import unzipped
 
         try:
-            return replace(self, checkpoint=opened(self.checkpoint))
+            return replace(self, checkpoint=unzipped(self.checkpoint))
         except (CheckpointError, OSError):  # whoever loads it says so
             return self
 

@@ -21,7 +21,7 @@ from mipmap_plugin.errors import CheckpointError, SceneError
 from mipmap_plugin.formats.atomic import named, settled, sha256
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.ply import read_header
-from mipmap_plugin.formats.splat_transform import WRITTEN
+from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.models import detect, load_model
@@ -58,7 +58,7 @@ def _outputs(target: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
 
 def _in_header(file: Path) -> dict[str, Any] | None:
     """The provenance in the header of a PLY, which another file may have replaced since the report was written; None in other formats."""
-    if file.suffix.lower() != ".ply" or file.name.lower().endswith(WRITTEN):
+    if file.suffix.lower() != ".ply" or is_written(file):
         return None
     try:
         return provenance_of(read_header(file).comments) or {"base": None}

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from mipmap_plugin.errors import CheckpointError, SettingsError
-from mipmap_plugin.formats.atomic import absolute, refuse_named_pipe
+from mipmap_plugin.formats.atomic import absolute
+from mipmap_plugin.formats.nodes import refuse_named_pipe
 
 Item = TypeVar("Item")
 

@@ -16,7 +16,7 @@ from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.models import detect
 from mipmap_plugin.models.outputs import parts_of, refuse_parts
 from mipmap_plugin.models.places import conversion_state, page_of, state_path
-from mipmap_plugin.models.zipped_folder import opened
+from mipmap_plugin.models.zipped_folder import unzipped
 from mipmap_plugin.scenes import OPTIONS, load_scene
 
 # Folders of an unpacked parcel.
@@ -46,7 +46,7 @@ def pack(job: Job) -> Parcel:
     """
     if job.needs_folder:
         raise SettingsError(job.needs_folder)
-    base = replace(job.base, checkpoint=opened(job.base.checkpoint))
+    base = replace(job.base, checkpoint=unzipped(job.base.checkpoint))
     checkpoint = detect(base.checkpoint)
     refuse_output(job.target, job.overwrite, parts_of(checkpoint.path, checkpoint.folder))  # which the worker cannot know
     folder = checkpoint.folder  # with the options and networks of the checkpoint, also where its PLY is given

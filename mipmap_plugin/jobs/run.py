@@ -13,7 +13,7 @@ from mipmap_plugin.jobs.finished import finished
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.limits import is_out_of_memory
 from mipmap_plugin.models.places import state_path
-from mipmap_plugin.models.zipped_folder import told
+from mipmap_plugin.models.zipped_folder import with_archives_named
 from mipmap_plugin.wrap import Wrapped
 
 
@@ -26,7 +26,7 @@ def run(job: Job, threads: int | None = None) -> Outcome:
             outcome = _attempt(job, threads)
         except KeyboardInterrupt as interrupt:
             outcome = Outcome(job, "interrupted", reason=str(interrupt) or "interrupted")
-    return replace(outcome, seconds=time.perf_counter() - began, warnings=tuple(told(each.message) for each in caught))
+    return replace(outcome, seconds=time.perf_counter() - began, warnings=tuple(with_archives_named(each.message) for each in caught))
 
 
 def _attempt(job: Job, threads: int | None) -> Outcome:
@@ -34,15 +34,15 @@ def _attempt(job: Job, threads: int | None) -> Outcome:
         return job.own_work(threads) or _finished_before(job) or _adapt(job, threads)
     except OutputExists as error:
         # Another process may have finished the same job meanwhile.
-        return _finished_before(job) or Outcome(job, "failed", reason=told(error))
+        return _finished_before(job) or Outcome(job, "failed", reason=with_archives_named(error))
     except MipmapPluginError as error:
-        return Outcome(job, "failed", reason=told(error))
+        return Outcome(job, "failed", reason=with_archives_named(error))
     except OSError as error:
-        return Outcome(job, "failed", reason=told(of_a_file(error)))
+        return Outcome(job, "failed", reason=with_archives_named(of_a_file(error)))
     except Exception as error:
         if isinstance(error, (MemoryError, RuntimeError)) and is_out_of_memory(error):
             return Outcome(job, "failed", reason="out of memory; use a smaller scale, fewer views or fewer jobs at a time")
-        return Outcome(job, "failed", reason=f"{type(error).__name__}: {told(error)}", trace=traceback.format_exc())
+        return Outcome(job, "failed", reason=f"{type(error).__name__}: {with_archives_named(error)}", trace=traceback.format_exc())
 
 
 def _finished_before(job: Job) -> Outcome | None:

@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import IO, cast
 
 from mipmap_plugin.jobs.job import Job, Outcome
-from mipmap_plugin.models.zipped_folder import told
+from mipmap_plugin.models.zipped_folder import with_archives_named
 
 # Where libraries look for the number of threads that they may start.
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -93,7 +93,7 @@ def do(job: Job, worker: Worker) -> Outcome:
         try:
             worker.begin(sent)
             outcome = worker.outcome()
-            return replace(outcome, job=job, reason=told(outcome.reason), warnings=tuple(map(told, outcome.warnings)))
+            return replace(outcome, job=job, reason=with_archives_named(outcome.reason), warnings=tuple(map(with_archives_named, outcome.warnings)))
         except WorkerDied as death:
             deaths += 1
             if worker.stopped:

@@ -42,7 +42,7 @@ class Switch:
 
 
 @dataclass(frozen=True)
-class CurvePoint:
+class ZoomPoint:
     """The quality of the level that is shown at a zoom."""
 
     zoom: float
@@ -59,5 +59,5 @@ class Contents:
     base: FrozenBase
     levels: list[Level]
     switches: list[Switch]  # between a level and the next: falling zooms
-    curve: list[CurvePoint]  # by falling zoom
+    curve: list[ZoomPoint]  # by falling zoom
     left_out: Sequence[LeftOut] = ()  # by falling scale

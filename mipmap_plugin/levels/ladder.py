@@ -16,7 +16,7 @@ from typing import Any
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.frozen_base import FrozenBase
-from mipmap_plugin.levels.contents import Contents, CurvePoint, LeftOut, Level, Switch
+from mipmap_plugin.levels.contents import Contents, LeftOut, Level, Switch, ZoomPoint
 from mipmap_plugin.levels.distance.ladder import by_distance, make_levels_by_distance
 from mipmap_plugin.levels.finished import Ladder
 from mipmap_plugin.levels.manifest import manifest
@@ -162,8 +162,11 @@ def _shown(levels: list[Level], yardstick: Yardstick, end: float) -> tuple[list[
 
 
 def _switches(levels: Sequence[Level], yardstick: Yardstick, end: float) -> list[Switch]:
-    """The best zooms to change between neighboring levels: between their scales, or above both where the coarser is better at the finer's own scale,
-    as merged splats may be where a viewer draws no small ones, or down to the end of the coarser's band where the finer is better at its scale."""
+    """The best zooms to change between neighboring levels. Each is sought between the scales of the two, with two exceptions.
+
+    Where the coarser level is better at the finer one's own scale, as merged splats may be where a viewer draws no small ones, it is sought above
+    both. Where the finer one is better at the coarser one's scale, it is sought down to the end of the coarser one's band. `end`: of the ladder.
+    """
     switches = []
     for above, (finer, coarser) in zip([levels[0], *levels], pairwise(levels), strict=False):
 
@@ -181,10 +184,10 @@ def _switches(levels: Sequence[Level], yardstick: Yardstick, end: float) -> list
     return switches
 
 
-def _curve(levels: Sequence[Level], edges: Sequence[float], yardstick: Yardstick, base_db: Callable[[float], float]) -> list[CurvePoint]:
+def _curve(levels: Sequence[Level], edges: Sequence[float], yardstick: Yardstick, base_db: Callable[[float], float]) -> list[ZoomPoint]:
     """The quality at falling zooms, of the level that is shown at each. `edges`: the ends of the levels' zooms, one more than levels."""
     return [
-        CurvePoint(zoom, number, yardstick.psnr(level.adapted, zoom), base_db(zoom))
+        ZoomPoint(zoom, number, yardstick.psnr(level.adapted, zoom), base_db(zoom))
         for number, (level, high, low) in enumerate(zip(levels, edges, edges[1:], strict=False))
         for zoom in reversed(zooms_between(min(low, high), high, CURVE_STEP))
     ]

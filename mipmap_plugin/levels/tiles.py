@@ -17,7 +17,6 @@ from __future__ import annotations
 import gzip
 import math
 import shutil
-import struct
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
@@ -31,8 +30,9 @@ from mipmap_plugin.camera import ONE_PIXEL
 from mipmap_plugin.errors import TEMPORARY, warn
 from mipmap_plugin.formats.atomic import new_folder, write_json
 from mipmap_plugin.formats.glb import FLOAT, before_binary
-from mipmap_plugin.formats.gltf import SPLATTING, SPZ_INSIDE
+from mipmap_plugin.formats.gltf import DISPLAY, SPLATTING, SPZ_INSIDE
 from mipmap_plugin.formats.splat_transform import write_exchange
+from mipmap_plugin.formats.spz import HEADER as SPZ_HEADER
 from mipmap_plugin.levels.exported import readable
 from mipmap_plugin.levels.manifest import CANVAS, read_manifest
 from mipmap_plugin.levels.streamed import Approach, distances
@@ -59,9 +59,6 @@ HALF_TURN = [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 
 COMPRESSION = SPZ_INSIDE[0]
 EXTENSIONS = {"extensionsUsed": [SPLATTING, COMPRESSION], "extensionsRequired": [SPLATTING, COMPRESSION]}
-
-# The header of an SPZ file, inside its gzip: magic number, version, count of splats, SH degree (github.com/nianticlabs/spz, 3).
-SPZ_HEADER = struct.Struct("<IIIB")
 
 BYTE = 5121  # glTF 2.0's code of that type of numbers
 
@@ -158,12 +155,12 @@ def write_tile(ply: Path, tile: Path) -> None:
 
 def glb(spz: bytes, low: list[float], high: list[float]) -> bytes:
     """A binary glTF of splats in SPZ, whose centers lie between `low` and `high`. Accessors have no bytes of their own: SPZ has them all."""
-    _, _, count, degree = SPZ_HEADER.unpack_from(gzip.decompress(spz))
+    _, _, count, degree, *_ = SPZ_HEADER.unpack_from(gzip.decompress(spz))
     types = {"POSITION": "VEC3", "COLOR_0": "VEC4", f"{SPLATTING}:ROTATION": "VEC4", f"{SPLATTING}:SCALE": "VEC3"}
     types |= {f"{SPLATTING}:SH_DEGREE_{band}_COEF_{n}": "VEC3" for band in range(1, degree + 1) for n in range(2 * band + 1)}
     more: dict[str, dict[str, Any]] = {"POSITION": {"min": low, "max": high}, "COLOR_0": {"componentType": BYTE, "normalized": True}}
     accessors = [{"componentType": FLOAT, "count": count, "type": kind, **more.get(name, {})} for name, kind in types.items()]
-    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "extensions": {COMPRESSION: {"bufferView": 0}}}
+    splats = {"kernel": "ellipse", "colorSpace": DISPLAY[0], "extensions": {COMPRESSION: {"bufferView": 0}}}
     primitive = {"mode": 0, "attributes": {name: i for i, name in enumerate(types)}, "extensions": {SPLATTING: splats}}
     document = {
         "asset": {"version": "2.0"}, **EXTENSIONS, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, "matrix": HALF_TURN}],

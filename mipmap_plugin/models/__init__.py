@@ -12,7 +12,7 @@ from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.detect import Checkpoint, detect
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import API_VERSION, BY_COMPANIONS, CERTAIN, PLAIN, Family, Files, Match
-from mipmap_plugin.models.zipped_folder import opened, retold, told
+from mipmap_plugin.models.zipped_folder import retold, unzipped, with_archives_named
 from mipmap_plugin.plugin_errors import is_third_party
 from mipmap_plugin.registry import load_target
 
@@ -45,8 +45,8 @@ def load_model(path: str | Path, *, iteration: int | None = None) -> mipmap_plug
     """
     checkpoint = detect(path, iteration=iteration)
     path = path_of(path)
-    if (folder := opened(path)) != path:
-        with retold(told):
+    if (folder := unzipped(path)) != path:
+        with retold(with_archives_named):
             return load_model(folder, iteration=iteration)
     from mipmap_plugin.models.contract import lacking
     from mipmap_plugin.process.torch_modes import usual_modes

@@ -11,7 +11,7 @@ from mipmap_plugin.formats.splat_transform import EXCHANGE, READ_ONLY, WRITTEN
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.families import BUILT_IN, find_family
 from mipmap_plugin.models.family import Files
-from mipmap_plugin.models.zipped_folder import opened
+from mipmap_plugin.models.zipped_folder import unzipped
 
 GLTF = (".glb", ".gltf")
 COMPRESSED = EXCHANGE["compressed"][1]
@@ -24,9 +24,11 @@ OWN_VIEWERS = ("gsplat", "gsplat-antialiased", "nerfstudio", "nerfstudio-antiali
 def adapted_name(checkpoint: Path, scale: float, viewer: str | None = None) -> str:
     """NAME_x0.25 or NAME_x0.25_spark, with the ending of what is saved; none for a folder. NAME is that of a link, not of what it leads to.
 
-    Exchange formats that can only be read, or have another ending, are written as a PLY, as is a PLY in a zip archive. glTF is written as .glb, but
-    as a PLY for a viewer that does not read that, and files of third-party families as these say (`Family.saves`), but as a PLY for any. What gsplat
-    and nerfstudio save becomes a folder of theirs, but a PLY for a viewer of others.
+    The ending is that of the file, but for these:
+    - an exchange format that is only read, or has another ending, and a PLY in a zip archive: .ply;
+    - glTF: .glb, or .ply for a viewer that does not read that;
+    - a third-party family: the one that it names (`Family.saves`), or .ply for any viewer;
+    - what gsplat and nerfstudio save: none, as it becomes a folder of theirs, or .ply for a viewer of others.
     """
     name = named(checkpoint).name
     read, written = _endings(checkpoint, name, viewer)
@@ -54,7 +56,7 @@ def _endings(checkpoint: Path, name: str, viewer: str | None) -> tuple[str, str]
         family = find_family(detect(checkpoint).family)
     except MipmapPluginError:  # whoever loads it says so
         return "", ""
-    if opened(checkpoint) != checkpoint:  # a folder in a zip archive
+    if unzipped(checkpoint) != checkpoint:  # a folder in a zip archive
         return Path(name).suffix, _of_folder(checkpoint, viewer)
     if family in BUILT_IN:
         written = ".ply" if family.name in ("zipped", "gltf", "exchange") else _of_folder(checkpoint, viewer)

@@ -215,7 +215,7 @@ def count_of(model: SplatModel, view: Camera, scale: float = 1.0) -> int:
 
 
 @torch.no_grad()
-def places(model: SplatModel, view: Camera) -> Tensor:
+def means_at(model: SplatModel, view: Camera) -> Tensor:
     """Where the rows of the parameters are at a view's moment, [N, 3] in world units: a field may carry splats far from where they rest."""
     moved = model.traits.moves and model.traits.rows == SPLATS
     return (model.gaussians(view).means if moved else model.parameters()["means"]).detach()

@@ -17,7 +17,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import OutputError, OutputExists, SettingsError
 from mipmap_plugin.models import contract, detect, load_model
 from mipmap_plugin.models.adapted_name import adapted_name
-from mipmap_plugin.models.base import Filtered, SplatModel, Thinned, why_no_viewer
+from mipmap_plugin.models.base import Filtered, SplatModel, Thinned, tensors_of, why_no_viewer
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes.orbits import Orbit
 from mipmap_plugin.wrap import Wrapped, wrap_model
@@ -178,7 +178,7 @@ def _untouched(model: SplatModel, checkpoint: Path) -> Iterator[None]:
 
 
 def _tensors(model: SplatModel) -> dict[str, Tensor]:
-    return {name: tensor.detach().clone() for name, tensor in {**model.parameters(), **model.shared_parameters()}.items()}
+    return {name: tensor.detach().clone() for name, tensor in tensors_of(model).items()}
 
 
 def _assert_same(before: dict[str, Tensor], model: SplatModel) -> None:

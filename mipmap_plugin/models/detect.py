@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,17 +11,13 @@ from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import OF_SPLATS, Family, Files, Match
-from mipmap_plugin.models.places import PARTS, REPORT, has_report
-from mipmap_plugin.models.zipped_folder import opened, retold, told
+from mipmap_plugin.models.folders import PHOTOGRAPHS, checkpoints_in, holds_points, is_model_folder, meant_instead, model_folders_below
+from mipmap_plugin.models.places import PARTS, has_report
+from mipmap_plugin.models.zipped_folder import retold, unzipped, with_archives_named
 
-# Suffixes of files of splats besides PLY, and of photographs.
-EXCHANGED, PHOTOGRAPHS = (".spz", ".sog", ".splat", ".ksplat", ".glb", ".gltf"), (".jpg", ".jpeg", ".png")
+# Suffixes of files of splats besides PLY.
+EXCHANGED = (".spz", ".sog", ".splat", ".ksplat", ".glb", ".gltf")
 OWN_SUFFIXES = (".ply", ".pt", ".ckpt", *EXCHANGED)
-
-# Columns of plain point clouds and meshes, among which are the points that a training starts from: input.ply, points3D.ply, sparse_pc.ply.
-OF_POINTS = frozenset(
-    ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha", "s", "t", "u", "v", "flags", "quality", "confidence", "intensity")
-)
 
 # What else people give, by its suffix: what it is, and what to do.
 OTHERS = {
@@ -38,8 +33,8 @@ OTHERS = {
 # The families of this package.
 OWN = frozenset(family.name for family in BUILT_IN)
 
-# A folder that is given too high is searched so deep, as nerfstudio's outputs/EXPERIMENT/METHOD/TIME are, and in so many folders; so many are named.
-DEPTH, MOST_LOOKED_AT, NAMED = 3, 200, 3
+# So many of the model folders below a folder are named.
+NAMED = 3
 
 
 @dataclass(frozen=True)
@@ -64,8 +59,8 @@ def detect(path: str | Path, *, iteration: int | None = None) -> Checkpoint:
     path = settled(path_of(path))
     if path.is_dir():
         return _detect_folder(path, iteration)
-    if (folder := opened(path)) != path:
-        with retold(told):
+    if (folder := unzipped(path)) != path:
+        with retold(with_archives_named):
             return _detect_folder(folder, iteration)
     if iteration is not None and path.exists():
         raise CheckpointError(f"{path} is a file and has no iterations; give its model folder to choose iteration {iteration}")
@@ -152,7 +147,7 @@ def _why_not(files: Files) -> str:
         return f"{path} is {other}"
     if kind == "3d-tiles":
         return f"{path} is the tileset of 3D Tiles; give one of its tiles (.glb)"
-    if kind == "unknown" and _is_whole(path.parent):  # as nerfstudio's commands take the config.yml
+    if kind == "unknown" and is_model_folder(path.parent):  # as nerfstudio's commands take the config.yml
         return f"{path} is one file of a model folder; give the folder, {path.parent}"
     if path.match("*transforms*.json") or path.name == "cameras.json":
         return f"{path} holds cameras, not splats; give the checkpoint, and this file by --cameras (cameras=)"
@@ -166,83 +161,26 @@ def _why_not(files: Files) -> str:
 def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
     if (folder / "point_cloud").is_dir():
         return _detect_iteration(folder, iteration)
-    if placed := next(_placed(folder), None):
+    if placed := next(checkpoints_in(folder), None):
         return _detect_step(*placed, folder, iteration)
     if iteration is not None:
         raise CheckpointError(f"{folder} has no point_cloud/iteration_{iteration}; give the model folder above it, or no iteration")
     files = sorted(folder.iterdir())
-    clouds = [file for file in files if file.suffix.lower() == ".ply" and not _holds_points(file)]
+    clouds = [file for file in files if file.suffix.lower() == ".ply" and not holds_points(file)]
     clouds = clouds or [file for file in files if file.suffix.lower() in EXCHANGED and file.is_file()]
     clouds = [cloud for cloud in clouds if not has_report(cloud)] or clouds  # no adaptations, where there is a base
     if len(clouds) > 1 and folder / "point_cloud.ply" in clouds:
         clouds = [folder / "point_cloud.ply"]
     if len(clouds) == 1:
         return detect(clouds[0])
-    if not clouds and folder.name in PARTS and _is_whole(folder.parent):
+    if not clouds and folder.name in PARTS and is_model_folder(folder.parent):
         raise CheckpointError(f"{folder} is one part of a model folder; give the folder, {folder.parent}")
     some = ", ".join([*(cloud.name for cloud in clouds[:5]), *["..."] * (len(clouds) > 5)])
-    if not clouds and (below := _below(folder)):
+    if not clouds and (below := model_folders_below(folder)):
         more = ", ..." if len(below) > NAMED else ""
         raise CheckpointError(f"{folder} lies above its checkpoint{'s' * (len(below) > 1)}; give {' or '.join(map(str, below[:NAMED]))}{more}")
-    content = f"{plural(len(clouds), 'file')} of splats ({some})" if clouds else f"no point_cloud folder and no file of splats{_instead(folder)}"
+    content = f"{plural(len(clouds), 'file')} of splats ({some})" if clouds else f"no point_cloud folder and no file of splats{meant_instead(folder)}"
     raise CheckpointError(f"{folder} holds {content}; give one file, or a model folder with point_cloud/iteration_<N>")
-
-
-def _holds_points(file: Path) -> bool:
-    """Whether a PLY holds a plain point cloud or a mesh."""
-    try:
-        return frozenset() < Files(file).columns <= OF_POINTS
-    except CheckpointError:
-        return False
-
-
-def _instead(folder: Path) -> str:
-    """What people mean who give a folder without splats, in words: a folder below, or what a scene is trained on."""
-    try:
-        entries = sorted(folder.iterdir())
-    except OSError:
-        return ""
-    meant = [entry for entry in entries if entry.is_dir() and any(entry.glob("*.ply"))]
-    if meant:
-        return f", but {', '.join(entry.name for entry in meant[:5])}{', ...' * (len(meant) > 5)}"
-    if points := [entry.name for entry in entries if entry.suffix.lower() == ".ply"]:
-        return f", but plain point clouds or meshes ({', '.join(points[:5])}{', ...' * (len(points) > 5)})"
-    if any(entry.suffix.lower() in PHOTOGRAPHS or entry.name in ("images", "sparse") or entry.match("transforms*.json") for entry in entries):
-        return ", but photographs or what a scene is trained on (that is for --images and --cameras)"
-    return ""
-
-
-def _below(folder: Path) -> list[Path]:
-    """The model folders at most DEPTH levels below a folder, as far as they are found among MOST_LOOKED_AT folders; the newest names first.
-
-    Without adaptations, where there is a base.
-    """
-    level, looked_at, found = [folder], 0, list[Path]()
-    for _ in range(DEPTH):
-        below = [each for parent in level for each in _folders_in(parent)][: MOST_LOOKED_AT - looked_at]
-        looked_at += len(below)
-        holding = [each for each in below if _is_whole(each)]
-        found += sorted(holding, reverse=True)
-        level = [each for each in below if each not in holding]
-    return [each for each in found if not _was_adapted(each)] or found
-
-
-def _was_adapted(folder: Path) -> bool:
-    """Whether a model folder has the report of an adaptation beside its checkpoint."""
-    return any(True for place in ("*", "point_cloud/*") for _ in folder.glob(f"{place}/*{REPORT}"))
-
-
-def _is_whole(folder: Path) -> bool:
-    """Whether a folder is a model folder."""
-    return (folder / "point_cloud").is_dir() or any(True for _ in _placed(folder, below=True))
-
-
-def _folders_in(folder: Path) -> list[Path]:
-    """The folders in a folder; none in one that cannot be read."""
-    try:
-        return sorted(each for each in folder.iterdir() if each.is_dir() and not each.is_symlink())
-    except OSError:
-        return []
 
 
 def _detect_iteration(folder: Path, wanted: int | None) -> Checkpoint:
@@ -266,30 +204,6 @@ def _detect_iteration(folder: Path, wanted: int | None) -> Checkpoint:
         except CheckpointError as error:
             troubles.append(str(error))
     raise CheckpointError(f"{folder} has no whole checkpoint: {'; '.join(troubles)}")
-
-
-def _placed(folder: Path, *, below: bool = False) -> Iterator[tuple[Family, dict[int, Path]]]:
-    """The families that have checkpoints in a result folder; `below`: in a subfolder. Families that fail are skipped here; `_claims` reports them."""
-    for name in FAMILIES.names():
-        try:
-            family = find_family(name)
-            if family.place and (family.place[0] or not below) and (steps := _steps(folder, family, *family.place)):
-                yield family, steps
-        except CheckpointError:
-            raise
-        except Exception:  # third-party code may fail in any way
-            continue
-
-
-def _steps(folder: Path, family: Family, below: str, pattern: str) -> dict[int, Path]:
-    """The checkpoints of a family in its place in a result folder by step, 0 for a name without one; of several ranks the first."""
-    place = folder / below
-    files = sorted(place.iterdir(), reverse=True) if place.is_dir() else []
-    named = {int(name.groupdict().get("step") or 0): file for file in files if (name := re.fullmatch(pattern, file.name))}
-    if below:
-        return named
-    # Files of other projects may have such names, too.
-    return {step: file for step, file in named.items() if family.recognize(Files(file))}
 
 
 def _detect_step(family: Family, steps: dict[int, Path], folder: Path, wanted: int | None) -> Checkpoint:

@@ -46,9 +46,9 @@ ANCHORS = {
 
 # Its networks; those of the second line are None or missing if they are not used.
 NETWORKS = {
-    **{"opacity_mlp": "mlp_opacity", "cov_mlp": "mlp_cov", "color_mlp": "mlp_color"},
-    **{"feature_bank_mlp": "mlp_feature_bank", "appearance": "embedding_appearance"},
-}
+    "opacity_mlp": "mlp_opacity", "cov_mlp": "mlp_cov", "color_mlp": "mlp_color",
+    "feature_bank_mlp": "mlp_feature_bank", "appearance": "embedding_appearance",
+}  # fmt: skip
 
 # Deformable 3D Gaussians keeps its network in another object; among the classes with these tensors only its own has no `capture`.
 MAY_MOVE = (
@@ -69,12 +69,15 @@ MORE = {
 def adopt(model: Any) -> SplatModel:
     """A model of this package itself, or a copy of another project's live model.
 
-    Accepted are a `GaussianModel` of INRIA's 3DGS or of a project that only trains it differently, Scaffold-GS's
-    `GaussianModel`, gsplat's `splats` (a dict or a ParameterDict) or what holds them under that name, as its trainer and its checkpoints do,
-    splatfacto's model, its `gauss_params`, and nerfstudio's pipeline or trainer around it, and `Gaussians`. Tensors may be NumPy arrays. The copy
-    is on the original's device. Splats that are not finite are dropped, as when a file is loaded.
-    Raises SettingsError for another object, ShapeError for tensors that do not fit together, CheckpointError
-    for networks that do not fit their anchors.
+    Accepted are:
+    - the `GaussianModel` of INRIA's 3DGS, of projects that only train it differently, and of Scaffold-GS;
+    - gsplat's `splats` (a dict or a ParameterDict), or what holds them under that name, as its trainer and its checkpoints do;
+    - splatfacto's model, its `gauss_params`, and nerfstudio's pipeline or trainer around it;
+    - `Gaussians`.
+
+    Tensors may be NumPy arrays. The copy is on the original's device. Splats that are not finite are dropped, as when a file is loaded.
+    Raises SettingsError for another object, ShapeError for tensors that do not fit together, CheckpointError for networks that do not fit their
+    anchors.
     """
     if callable(getattr(model, "gaussians", None)):
         if members := lacking(model):

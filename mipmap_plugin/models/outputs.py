@@ -15,7 +15,7 @@ from mipmap_plugin.errors import OutputExists, SettingsError, plural, some_of
 from mipmap_plugin.formats.atomic import absolute, named, refuse_output, refuse_to_lose
 from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.formats.ply import read_header
-from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_glb, is_spz, is_written, refuse_ending, refuse_exchange
+from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_spz, refuse_ending, refuse_exchange, written_ending
 from mipmap_plugin.formats.spz import fraction_for
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
@@ -80,9 +80,9 @@ def refuse_format(path: Path, trained: TrainedScale, parameters: Mapping[str, Te
     if trained.keeps_filter:
         own = f"the filter of their own project ({trained.told()})"
         raise SettingsError(f"{path}: these splats need {own}; give a .ply or a folder, or adapt for a viewer if the family allows it")
-    if not is_glb(path):
+    if written_ending(path) != ".glb":
         refuse_exchange(path)
-    if path.suffix.lower() == ".spz":
+    if is_spz(path):
         refuse_far(path, parameters, "give a .sog or a .ply")
 
 
@@ -104,11 +104,11 @@ def refuse_far(path: Path, parameters: Mapping[str, Tensor], instead: str) -> No
 
 def without_place(path: Path, extras: Iterable[str], sh_degree: int) -> str:
     """What the file at `path` will not hold, in a sentence: columns that 3DGS does not define, high SH bands; "" if it holds everything."""
-    if not is_written(path):
+    if not (ending := written_ending(path)):
         return ""
     names = ", ".join(extras)
-    lost = [f"the extra columns {names} are dropped, since {_ending(path)} has no place for them; a .ply has"] if names else []
-    without = "glTF has no place for" if is_glb(path) else f"{TOOL} does not write"
+    lost = [f"the extra columns {names} are dropped, since {ending} has no place for them; a .ply has"] if names else []
+    without = "glTF has no place for" if ending == ".glb" else f"{TOOL} does not write"
     lost += [f"SH bands above degree {MOST_BANDS} are dropped, which {without}; a .ply has them"] if sh_degree > MOST_BANDS else []
     return "; ".join(lost)
 
@@ -136,14 +136,10 @@ def cut_off(path: Path, parameters: Mapping[str, Tensor]) -> str:
 
 def drawn_otherwise(path: Path, trained: TrainedScale) -> str:
     """That many viewers of the exchange format of `path` do not draw splats as they were trained, in a sentence; "" if they do, or of a .ply."""
-    if trained.screen_filter == TrainedScale.screen_filter or not is_written(path):
+    if trained.screen_filter == TrainedScale.screen_filter or not (ending := written_ending(path)):
         return ""
     right = f"the file is right where splats are drawn as in training ({trained.told()})"
-    return f"{right}, which not all viewers of {_ending(path)} do; for others adapt for a viewer"
-
-
-def _ending(path: Path) -> str:
-    return ".compressed.ply" if path.name.lower().endswith(".compressed.ply") else path.suffix.lower()
+    return f"{right}, which not all viewers of {ending} do; for others adapt for a viewer"
 
 
 def finite(parameters: Mapping[str, Tensor], most: float) -> dict[str, Tensor]:

@@ -17,7 +17,7 @@ from mipmap_plugin.errors import SettingsError, ShapeError, warn
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.glb import write_glb
 from mipmap_plugin.formats.ply import write_ply
-from mipmap_plugin.formats.splat_transform import MOST_BANDS, is_glb, is_written, write_exchange
+from mipmap_plugin.formats.splat_transform import MOST_BANDS, is_written, write_exchange, written_ending
 from mipmap_plugin.formats.tags import with_tags
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale, Traits
@@ -217,7 +217,7 @@ class VanillaModel:
             for lost in filter(None, (without_place(path, self._origin.extras, self.sh_degree), cut_off(path, parameters))):
                 warn(lost)
             exchanged = self._columns(parameters | {"shN": parameters["shN"][:, : (MOST_BANDS + 1) ** 2 - 1]})
-            if is_glb(path):
+            if written_ending(path) == ".glb":
                 return write_glb(path, exchanged, comments, overwrite=overwrite)
             return write_exchange(path, lambda ply: write_ply(ply, exchanged, comments), overwrite=overwrite)
         if self._origin.host and path.suffix.lower() != ".ply":

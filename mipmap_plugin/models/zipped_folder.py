@@ -23,7 +23,7 @@ _OPENED: dict[tuple[Path, int, int], tuple[tempfile.TemporaryDirectory[str], Pat
 _LOCK = threading.Lock()
 
 
-def opened(path: Path) -> Path:
+def unzipped(path: Path) -> Path:
     """The unpacked model folder of a zip archive that holds one; `path` itself if it is anything else. Raises CheckpointError."""
     if not (path.is_file() and is_archive(path)) or (root := _root(path)) is None:
         return path
@@ -49,8 +49,8 @@ def retold(retell: Callable[[object], str]) -> Iterator[None]:
         warn(retell(doubt.message), doubt.category)
 
 
-def told(words: object) -> str:
-    """What is said of files in unpacked folders, as said of the archives (`retold`)."""
+def with_archives_named(words: object) -> str:
+    """What is said of files, with the names of archives in place of the folders that these were unpacked to (`retold`)."""
     text = str(words)
     for (path, *_), (_, folder) in list(_OPENED.items()):
         text = text.replace(str(folder), str(path))

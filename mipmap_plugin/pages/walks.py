@@ -10,7 +10,7 @@ from torch import Tensor
 from mipmap_plugin.errors import plural
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.levels.distance.manifest import DistanceContents
-from mipmap_plugin.levels.distance.walks import focal_of
+from mipmap_plugin.levels.distance.walks import mean_focal
 from mipmap_plugin.levels.distance.yardstick import Seen, WalkPoint, Walks
 from mipmap_plugin.pages.gallery import effects_of_base
 from mipmap_plugin.pages.levels import lead, rounded
@@ -37,7 +37,7 @@ def walks_page(title: str, ladder: DistanceContents, manifest: dict[str, Any], c
 def _zoom(ladder: DistanceContents, walks: Walks, seen: Seen, point: WalkPoint) -> Zoom:
     """The base in the viewer, the levels as it mixes them, and the supersampled base. `point`: the means of all walks."""
     view = walks.views[0]
-    scale = 1 - seen.way / (seen.pixel * focal_of(view))
+    scale = 1 - seen.way / (seen.pixel * mean_focal(view))
     base = _picture(f"base in {ladder.scene.request.viewer}", "base", seen.base, seen, point.base_db, len(ladder.scene.splats))
     mixture = _picture("levels as shown", "adapted", seen.mixture, seen, point.psnr_db, seen.splats)
     truth = Picture("base, supersampled", "truth", seen.truth, note=TRUTH)

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from mipmap_plugin.camera import DIGITS, Camera, digest_of
 from mipmap_plugin.errors import SceneError, SettingsError, plural
-from mipmap_plugin.formats.images import image_size, is_file, read_image, shown_turned
+from mipmap_plugin.formats.images import image_size, read_image, shown_turned
+from mipmap_plugin.formats.nodes import is_file
 from mipmap_plugin.scenes.lenses import Lens, can_undistort
 
 # The word of notes on photographs that are not there.

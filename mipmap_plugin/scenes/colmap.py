@@ -14,8 +14,9 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError, brief, plural, some_of, warn
-from mipmap_plugin.formats.images import image_size, is_file
+from mipmap_plugin.formats.images import image_size
 from mipmap_plugin.formats.json_file import pixels
+from mipmap_plugin.formats.nodes import is_file
 from mipmap_plugin.scenes.base import ABSENT, MASKED, SPLIT, Scene, note_on_shapes, other_shape
 from mipmap_plugin.scenes.colmap_sizes import refuse_truncated
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, note

@@ -14,8 +14,9 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError, plural
-from mipmap_plugin.formats.images import image_size, is_file, read_array
+from mipmap_plugin.formats.images import image_size, read_array
 from mipmap_plugin.formats.json_file import positive, rotation
+from mipmap_plugin.formats.nodes import is_file
 from mipmap_plugin.scenes.base import Scene
 from mipmap_plugin.scenes.training_options import DEFORMABLE, trained_size
 from mipmap_plugin.scenes.transforms import viewmat_from_opengl

@@ -14,8 +14,9 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera, viewmat_of
 from mipmap_plugin.errors import SceneError, some_of
-from mipmap_plugin.formats.images import image_size, is_file
+from mipmap_plugin.formats.images import image_size
 from mipmap_plugin.formats.json_file import numbers, pixels, positive, present, read_json, rotation
+from mipmap_plugin.formats.nodes import is_file
 from mipmap_plugin.scenes.base import Scene
 from mipmap_plugin.scenes.training_options import DEFORMABLE, trained_size
 

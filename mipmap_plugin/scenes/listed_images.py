@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
-from mipmap_plugin.formats.images import is_file
+from mipmap_plugin.formats.nodes import is_file
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 IMAGE_SUFFIXES = ("", *SUFFIXES, *(suffix.upper() for suffix in SUFFIXES))

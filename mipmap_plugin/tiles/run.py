@@ -21,7 +21,7 @@ from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import BackendUnavailable, JobsFailed, SceneError, SettingsError, some_of
-from mipmap_plugin.formats.atomic import delete, new_file, together, write_json
+from mipmap_plugin.formats.atomic import delete, together, write_json
 from mipmap_plugin.formats.here import told_from_here
 from mipmap_plugin.formats.ply_rows import concatenate
 from mipmap_plugin.formats.tags import with_tags
@@ -239,14 +239,10 @@ def _save(scene: TiledScene, job: Job, files: Sequence[Path], joined: Joined) ->
     """Write the cores one after the other, as a .ply or within a model folder, and the report beside it."""
     provenance = {**joined.report.provenance(), "tiles": len(files)}
     comments = with_tags(scene.comments, scene.target.screen_filter, provenance, scene.target.eps2d)
-
-    def write(ply: Path, overwrite: bool = True) -> None:
-        with new_file(ply, overwrite) as temporary, temporary.open("xb") as out:
-            concatenate(files, comments, out)
-
+    write = partial(concatenate, files=files, comments=comments)
     with together(job.target, [scene.folder, lock_of(scene.folder), *page_of(job.target)]):
         if job.target.suffix.lower() == ".ply":
-            write(saved := job.target, job.overwrite)
+            saved = write(job.target, overwrite=job.overwrite)
         else:
             trained = scene.wrapped.model.trained.drawn_with(scene.target)
             degree = scene.wrapped.model.gaussians(scene.wrapped.any_camera()).sh_degree

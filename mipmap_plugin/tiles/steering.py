@@ -84,7 +84,7 @@ def steer(scene: TiledScene, sweep: Sweep) -> None:
         found = quality(scene, open_state(scene, state), truths)
         checked.append(found.visible)
         if found.visible < (start.quality if warms_up else reached).visible - HARM_DB and scene.config.returns == "best":
-            ceiling, harmful = RATE_REDUCTION * rate_factor(scene, step, ceiling), True
+            ceiling, harmful = RATE_REDUCTION * min(warmed_up(step, scene.config), ceiling), True
             break
         if found.visible >= reached.visible - TIE_DB:
             best, reached = state, max(reached, found)
@@ -107,8 +107,3 @@ def next_planned(scene: TiledScene, sweep: Sweep) -> Sweep | None:
     """The sweep that comes after one and its repetitions."""
     planned = scene.sweeps[sweep.planned + 1 : sweep.planned + 2]
     return replace(planned[0], number=sweep.number + 1, halos=sweep.number + 1) if planned else None
-
-
-def rate_factor(scene: TiledScene, step: int, ceiling: float) -> float:
-    """The factor of all rates in a step."""
-    return min(warmed_up(step, scene.config), ceiling)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera, evenly, viewmat_of
-from mipmap_plugin.models.base import places
+from mipmap_plugin.models.base import means_at
 from mipmap_plugin.scenes.photographed import GOLDEN
 from mipmap_plugin.scenes.trajectories import rotation_matrix
 from mipmap_plugin.viewing.screen import inside
@@ -27,7 +27,7 @@ PIXELS, BASE_PIXELS = 120_000, 400_000
 
 def views_for_screen(base: Wrapped, screen: Camera, look_at: Tensor, scale: float) -> list[Camera]:
     """Views of the base's scale to adapt to for what `screen`, a camera of the new scale, shows around the point `look_at` [3]."""
-    means = places(base.model, screen)
+    means = means_at(base.model, screen)
     near = [part(turned(screen, look_at, number), means, scale, number).zoomed(1 / scale) for number in range(NEAR)]
     given = base.cameras or base.viewpoints.best(evenly(base.views(), OWN))
     train = [view for view in given if view.split == "train"] or given

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.errors import MipmapPluginError, SettingsError
+from mipmap_plugin.formats.images import in_8_bits
 from mipmap_plugin.limits import is_out_of_memory
 from mipmap_plugin.viewing.adapting import Adapter, Live, Wish
 from mipmap_plugin.viewing.controls import AS_TRAINED, DISTANCE, NOWHERE, Controls, plain
@@ -173,7 +172,7 @@ class Page:
         pose, width, height = view
         picture = self._stage.draw(look, pose.camera(width, height), coarse)
         self._pace.learn(picture.drawn.width * picture.drawn.height, picture.seconds)
-        client.scene.set_background_image(_bytes(picture.image), format="png" if coarse == 1 else "jpeg", jpeg_quality=QUALITY)
+        client.scene.set_background_image(in_8_bits(picture.image), format="png" if coarse == 1 else "jpeg", jpeg_quality=QUALITY)
         if coarse == 1:
             self._controls.tell_picture(picture)
 
@@ -283,8 +282,3 @@ def _move(client: Any, pose: Pose) -> None:
         client.camera.position = pose.position
         client.camera.look_at = pose.look_at
         client.camera.fov = pose.fov
-
-
-def _bytes(image: Tensor) -> Any:
-    """An image [H, W, 3] in 0..1 as NumPy's 8 bits."""
-    return (255 * image).round().byte().cpu().numpy()

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.curve import Stopwatch, decibel
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.models.base import places
+from mipmap_plugin.models.base import means_at
 from mipmap_plugin.viewing.screen import Sampling
 from mipmap_plugin.viewing.sources import Request, Source, Supersampled
 from mipmap_plugin.wrap import Wrapped
@@ -51,7 +51,7 @@ class Stage:
         """`others`: the base itself among them; `reference`: what adapting aims at."""
         self.base, self.reference = base, reference
         views, self._device = base.views(), base.model.parameters()["means"].device
-        self.sampling = Sampling(places(base.model, views[0]), views)
+        self.sampling = Sampling(means_at(base.model, views[0]), views)
         self.sources: dict[str, Source] = {}
         for source in (*others, reference):
             self.add(source)

@@ -2,7 +2,7 @@
 
 import json
 
-from viewers import Row, count_of, keep, page
+from viewers import Row, keep, page
 
 
 def test_what_is_not_measured_again_is_kept(tmp_path):
@@ -17,8 +17,3 @@ def test_a_file_that_was_not_measured_is_a_dash():
     rows = [Row("lego", scale, "spark", file, 9000, quality) for scale, file, quality in facts]
     lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page(rows).splitlines() if line.startswith("| x")]
     assert lines == [["x1", "spark", "20.0 (9.0)", "–"], ["x0.5", "spark", "21.0 (9.0)", "13.0 (9.0)"]]
-
-
-def test_splats_are_counted_in_the_header(tmp_path):
-    (tmp_path / "three.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n")
-    assert count_of(tmp_path / "three.ply") == 3

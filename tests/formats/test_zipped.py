@@ -125,10 +125,10 @@ def test_what_is_adapted_from_it_is_a_folder_beside_it(tmp_path, folder):
 
 def test_it_is_unpacked_once_and_without_its_pictures(tmp_path, folder, monkeypatch):
     path = packed(tmp_path / "a.zip", folder, beside={"my model/test/ours_7000/1.png": b"x", "my model/point_cloud/more.txt": b"x"})
-    place = zipped_folder.opened(path)
+    place = zipped_folder.unzipped(path)
     assert not (place / "test").exists() and (place / "point_cloud" / "more.txt").exists()
     monkeypatch.setattr(zipped_folder, "copied", None)
-    assert zipped_folder.opened(path) == place and len(load_model(path)) == 60
+    assert zipped_folder.unzipped(path) == place and len(load_model(path)) == 60
 
 
 @pytest.mark.parametrize("name", ["point_cloud/../../x", ".."])
@@ -140,7 +140,7 @@ def test_a_name_that_leads_out_of_the_folder_is_refused(tmp_path, folder, name):
 
 @pytest.mark.parametrize("name", ["log_12:30:01.txt", "c:x", "point_cloud/..\\x"])
 def test_a_name_that_windows_takes_for_a_place_is_left_out(tmp_path, folder, name):
-    place = zipped_folder.opened(packed(tmp_path / "a.zip", folder, beside={f"my model/{name}": b"x"}))
+    place = zipped_folder.unzipped(packed(tmp_path / "a.zip", folder, beside={f"my model/{name}": b"x"}))
     assert {path.name for path in place.iterdir()} == {path.name for path in folder.iterdir()}
     assert not list(place.rglob("*x")) and not list(place.parent.glob("*x"))
 

@@ -7,7 +7,6 @@ import torch
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.levels.distance.mixture import together
 from mipmap_plugin.models.vanilla import VanillaModel
 
 
@@ -16,7 +15,7 @@ def with_background(near=300, far=200):
     rng, ball = torch.Generator().manual_seed(3), tiny.gaussians(near, degree=0)
     sky = tiny.gaussians(far, degree=0, seed=5, spread=1.0)
     away = sky.means / sky.means.norm(dim=1, keepdim=True) * (14 + 8 * torch.rand(far, 1, generator=rng))
-    return together([replace(ball, scales=ball.scales / 3), replace(sky, means=away, scales=8 * sky.scales)])
+    return replace(ball, scales=ball.scales / 3).joined(replace(sky, means=away, scales=8 * sky.scales))
 
 
 def wrapped(**counts):

@@ -18,8 +18,8 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.levels.distance.chunks import Chunks, shrunk
 from mipmap_plugin.levels.distance.ladder import by_distance, scene_of
-from mipmap_plugin.levels.distance.mixture import Mixture, together
-from mipmap_plugin.levels.distance.rule import DistanceRule, focal, is_unbounded, nearest
+from mipmap_plugin.levels.distance.mixture import Mixture, joined
+from mipmap_plugin.levels.distance.rule import DistanceRule, focal_along_shorter_side, is_unbounded, nearest
 from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground
 from mipmap_plugin.levels.distance.yardstick import Walks
 from mipmap_plugin.levels.request import Band, LadderRequest
@@ -61,12 +61,12 @@ def test_lod_base_distance_is_that_of_playcanvas():
     base_distance, multiplier = RULE.playcanvas(1000)
     assert multiplier == 2.0
     camera = Camera(2000, 1000, 500 / math.tan(math.pi / 8), 500 / math.tan(math.pi / 8), 1000, 500, torch.eye(4))
-    assert base_distance / focal(camera) == pytest.approx(RULE.first)
+    assert base_distance / focal_along_shorter_side(camera) == pytest.approx(RULE.first)
 
 
 def test_the_rule_counts_the_shorter_side():
     wide = Camera(200, 100, 50.0, 60.0, 100, 50, torch.eye(4))
-    assert focal(wide) == 60.0 and focal(replace(wide, width=100, height=200)) == 50.0
+    assert focal_along_shorter_side(wide) == 60.0 and focal_along_shorter_side(replace(wide, width=100, height=200)) == 50.0
 
 
 def test_the_rule_follows_from_the_nearest_parts():
@@ -91,7 +91,7 @@ def test_splats_in_no_picture_have_no_part_in_the_rule():
     away = eye / eye.norm()
     behind, before = (tiny.gaussians(count, degree=0, spread=1e-4, seed=count) for count in (150, 45))
     hidden = [replace(behind, means=behind.means + eye + 0.2 * away), replace(before, means=before.means + eye - 0.005 * away)]
-    base, cluttered = (wrap_model(VanillaModel.from_gaussians(together(parts), tiny.model(1).trained), cameras=views, backend="cpu", threads=1)
+    base, cluttered = (wrap_model(VanillaModel.from_gaussians(joined(parts), tiny.model(1).trained), cameras=views, backend="cpu", threads=1)
                        for parts in ([ball], [ball, *hidden]))  # fmt: skip
     request = LadderRequest("playcanvas", coarsest=1 / 8)
     rules = [scene_of(each, request, request.first_band(each)) for each in (base, cluttered)]

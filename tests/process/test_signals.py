@@ -31,7 +31,7 @@ import os, signal, sys
 from mipmap_plugin import cli, models
 
 def told(path, **_):
-    models.zipped_folder.opened(path)
+    models.zipped_folder.unzipped(path)
     assert os.listdir("unpacked")
     signal.raise_signal(signal.SIGTERM)
 

@@ -13,8 +13,8 @@ from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.errors import CheckpointError
-from mipmap_plugin.formats.ply import read_header
+from mipmap_plugin.errors import CheckpointError, SettingsError
+from mipmap_plugin.formats.ply import MAX_HEADER, read_header
 from mipmap_plugin.formats.ply_rows import PlyRows, concatenate
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.models.base import TrainedScale
@@ -205,16 +205,22 @@ def test_a_file_whose_rows_have_no_known_place_is_refused(tmp_path, header, mess
 
 def test_a_concatenation_has_the_bytes_of_its_parts_in_their_order(tmp_path):
     parts = [tiny.model(150, seed=seed).save(tmp_path / f"part_{seed}.ply", provenance={}) for seed in (0, 1)]
-    with (tmp_path / "whole.ply").open("wb") as out:
-        assert concatenate(parts, ["of two parts"], out) == 300
+    whole = concatenate(tmp_path / "whole.ply", parts, ["of two parts"])
     bodies = b"".join(part.read_bytes()[read_header(part).body :] for part in parts)
-    header = read_header(tmp_path / "whole.ply")
-    assert (tmp_path / "whole.ply").read_bytes()[header.body :] == bodies
+    header = read_header(whole)
+    assert whole.read_bytes()[header.body :] == bodies
     assert header.vertex.count == 300 and header.comments == ("of two parts",) and not header.notes
 
 
 def test_parts_of_other_columns_are_refused(tmp_path):
     first = tiny.model(degree=1).save(tmp_path / "first.ply", provenance={})
     other = tiny.model(degree=2).save(tmp_path / "other.ply", provenance={})
-    with (tmp_path / "whole.ply").open("wb") as out, pytest.raises(CheckpointError, match="has other columns than"):
-        concatenate([first, other], [], out)
+    with pytest.raises(CheckpointError, match="has other columns than"):
+        concatenate(tmp_path / "whole.ply", [first, other], [])
+
+
+def test_comments_that_no_header_holds_are_refused_also_of_a_concatenation(tmp_path):
+    part, whole = tiny.model().save(tmp_path / "part.ply", provenance={}), tmp_path / "whole.ply"
+    with pytest.raises(SettingsError, match="but a PLY header holds"):
+        concatenate(whole, [part], ["x" * MAX_HEADER])
+    assert not whole.exists()

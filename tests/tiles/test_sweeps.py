@@ -192,7 +192,7 @@ def test_a_loss_that_nobody_sees_is_no_harm(halved, measured, monkeypatch):
 )  # fmt: skip
 def test_what_does_harm_to_the_whole_is_undone(halved, measured, monkeypatch, psnrs, kept, ceiling):
     measured(*psnrs)
-    monkeypatch.setattr(steering, "rate_factor", lambda *_: 1.0)
+    monkeypatch.setattr(steering, "warmed_up", lambda *_: 1.0)
     steering.steer(halved, Sweep(0, 0, tuple(range(1, max(2, len(psnrs)) + 1)), 0, 0))
     after = Steered.before(halved.folder, 1)
     assert (max(after.step, 0), after.ceiling, tuple(after.checked)) == (kept, ceiling, psnrs)
@@ -212,7 +212,7 @@ def test_a_little_loss_in_the_warm_up_is_no_harm_and_it_is_not_repeated(halved, 
 
 def test_what_did_harm_is_done_again_in_front_of_the_same_halos_but_not_for_ever(halved, measured, monkeypatch):
     measured(31.0, 29.0, 29.0, 29.0, 32.0, 29.0, 33.0)
-    monkeypatch.setattr(steering, "rate_factor", lambda scene, step, ceiling: ceiling)
+    monkeypatch.setattr(steering, "warmed_up", lambda *_: 1.0)
     monkeypatch.setitem(halved.__dict__, "sweeps", [Sweep(0, 0, (1, 2, 3), 0, 0), Sweep(1, 3, (4,), 1, 1)])
     made, sweep = [], sweep_of(halved, 0)
     while sweep is not None:

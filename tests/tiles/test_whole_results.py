@@ -24,7 +24,6 @@ from mipmap_plugin.formats import staging
 from mipmap_plugin.formats.ply import read_header, read_ply
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job
-from mipmap_plugin.levels.distance.mixture import together
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.mip import MipModel
@@ -215,7 +214,7 @@ def test_viewers_of_other_near_planes_draw_their_own_views(job):
     register_viewer("close", Viewer("close", "One that draws what is close", "nowhere", "classic", 0.3, near_plane=0.01), replace=True)
     away = torch.tensor([50.0, 0, 0])
     near = replace(tiny.gaussians(40, spread=0.005), scales=torch.full((40, 3), 0.002))
-    whole = together([tiny.gaussians(80), replace(near, means=near.means + away)])
+    whole = tiny.gaussians(80).joined(replace(near, means=near.means + away))
     first, *others = tiny.cameras(3, width=20, height=16)
     beside = first.looking_from(viewmat_of(torch.eye(3, dtype=torch.float64), away.double() - torch.tensor([0, 0, 0.1])), "near")
     base = job.target.with_name("near")

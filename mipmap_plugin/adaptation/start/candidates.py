@@ -22,7 +22,7 @@ from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.adaptation.start.strength import POWERS, Bounds, Candidate, Merger, MergingCosts
 from mipmap_plugin.adaptation.start.thinning import evenly_in_space, least_fraction
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import SPLATS, SplatModel, Thinned, places
+from mipmap_plugin.models.base import SPLATS, SplatModel, Thinned, means_at
 from mipmap_plugin.models.contract import rebuild, reshape
 
 # Crispnesses also tried where a zoom-in below CRISPER_BELOW takes no steps: from there on the softest always looks best, shrunk, even of thin wires.
@@ -262,7 +262,7 @@ class StartSearch:
         if self._forms:
             with self._problem.phase("closed form"):
                 views = self._problem.views
-                seen = places(student, views[0]) if student.traits.moves and student.traits.rows == SPLATS else None
+                seen = means_at(student, views[0]) if student.traits.moves and student.traits.rows == SPLATS else None
                 reshape(student, lambda rest: self._closed_form(rest if seen is None else replace(rest, means=seen), weights), views)
 
     def _merge(self, student: SplatModel, weights: Tensor, fraction: float, coarsely: bool) -> Tensor:

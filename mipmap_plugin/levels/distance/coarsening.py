@@ -13,7 +13,6 @@ from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, MIN_AXIS, min
 from mipmap_plugin.adaptation.start.merging import merge
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.levels.distance.mixture import together
 from mipmap_plugin.levels.request import KEPT, POWER
 from mipmap_plugin.screen_filters import COMPENSATED
 
@@ -44,7 +43,7 @@ def coarsened(
         in_pixels = weights[changes] * (pixels[changes] / coarser).square()
         moved, _ = merge(moved, torch.full_like(in_pixels, coarser), in_pixels[:, None], kept / len(moved))
     scales, opacities = shaped(moved, pixel_of(moved.means).clamp(finer, coarser), coarser, target)
-    return together([still, replace(moved, scales=scales, opacities=opacities)]), len(still)
+    return still.joined(replace(moved, scales=scales, opacities=opacities)), len(still)
 
 
 def shaped(splats: Gaussians, before: Tensor, after: float, target: Effects) -> tuple[Tensor, Tensor]:

@@ -18,7 +18,7 @@ from mipmap_plugin.levels.distance.level import AS_FINER, LevelRun
 from mipmap_plugin.levels.distance.manifest import DistanceContents, manifest
 from mipmap_plugin.levels.distance.rule import DistanceRule, is_unbounded, nearest
 from mipmap_plugin.levels.distance.scene import DistanceScene
-from mipmap_plugin.levels.distance.walks import focal_of, foreground
+from mipmap_plugin.levels.distance.walks import foreground, mean_focal
 from mipmap_plugin.levels.distance.yardstick import measured
 from mipmap_plugin.levels.finished import Ladder
 from mipmap_plugin.levels.request import STREAMING, Band, LadderRequest
@@ -100,10 +100,5 @@ def scene_of(base: FrozenBase, request: LadderRequest, band: Band) -> DistanceSc
         splats, views = base.model.gaussians(base.any_camera()).detach(), base.views()
         pixels = seen_pixel_size(splats.means, views, base.effects().near_plane)
         rule = DistanceRule.of(pixels, request, band)
-        extent = chunk_extent(nearest(pixels) * focal_of(views[0]))
+        extent = max(1, round(CHUNK * nearest(pixels) * mean_focal(views[0])))
         return DistanceScene(base, request, rule, Chunks.of(splats, extent, LEAST_OF_BASE), extent, base.target(request.viewer), backend, note)
-
-
-def chunk_extent(distance: float) -> int:
-    """The largest side of a chunk in world units, for a scene whose nearest parts are at this distance."""
-    return max(1, round(CHUNK * distance))

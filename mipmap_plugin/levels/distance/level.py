@@ -29,7 +29,6 @@ from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Calls
 from mipmap_plugin.camera import Camera, digest_of, evenly
-from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import colorless, explain
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance.coarsening import coarsened, kept_splats
@@ -49,7 +48,7 @@ SAMPLES = 2
 # What the state is called in which a level is the finer one, unchanged.
 AS_FINER = "the finer level as it is"
 
-# A view is used at least so many times in a run, because its truth costs as much as several steps.
+# A view is used at least so many times in a run, or else it would not be worth its truth, which costs as much as several steps.
 USES = 6
 
 
@@ -77,7 +76,8 @@ class LevelRun:
         self.size = scene.rule.middle(self.number)
         cameras = scene.views if scene.base.cameras else []
         chosen, note = choose_views(cameras, viewpoints, self.config)
-        views, held_out = split_validation(cameras, evenly(chosen, _most_views(self.config)), viewpoints, 1.0, self.config)
+        most = max(self.config.validation_views, self.config.steps * self.config.views_per_step // USES)
+        views, held_out = split_validation(cameras, evenly(chosen, most), viewpoints, 1.0, self.config)
         begins: dict[Camera, Camera] = {}
 
         def walked(starts: Sequence[Camera]) -> list[Camera]:
@@ -224,8 +224,3 @@ class LevelRun:
         figures = f"{psnrs[best]:.1f} dB where it is shown, where the finer level would have {psnrs[AS_FINER]:.1f}"
         warn(note := f"level_{self.number} has {figures}, with more splats; more steps would better it")
         return [note]
-
-
-def _most_views(config: AdaptConfig) -> int:
-    """The number of views above which a view would be used too rarely to be worth its truth (`USES`)."""
-    return max(config.validation_views, config.steps * config.views_per_step // USES)

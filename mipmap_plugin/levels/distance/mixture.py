@@ -11,7 +11,7 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance.chunks import Chunks
-from mipmap_plugin.levels.distance.rule import DistanceRule, focal
+from mipmap_plugin.levels.distance.rule import DistanceRule, focal_along_shorter_side
 from mipmap_plugin.splatting.harmonics import C0
 
 
@@ -33,16 +33,16 @@ class Mixture:
     def streamed(cls, rule: DistanceRule, extent: float, levels: Sequence[Gaussians]) -> Mixture:
         """Levels that are all made, cut together into chunks of this extent, as splat-transform writes them."""
         colorless = [replace(level, sh=level.sh[:, :1]) for level in levels]  # which spares a copy of what is largest
-        return cls.of(rule, Chunks.of(together(colorless), extent), levels)
+        return cls.of(rule, Chunks.of(joined(colorless), extent), levels)
 
     def shown(self, camera: Camera) -> Tensor:
         """The level at which the camera sees each chunk, [C]."""
-        return self.rule.level(self.chunks.distances(camera.center) / focal(camera))
+        return self.rule.level(self.chunks.distances(camera.center) / focal_along_shorter_side(camera))
 
     def splats(self, camera: Camera) -> Gaussians:
         """The splats that the camera sees."""
         shown = self.shown(camera)
-        return together([level[shown[place] == number] for number, (level, place) in enumerate(zip(self.levels, self.places, strict=True))])
+        return joined([level[shown[place] == number] for number, (level, place) in enumerate(zip(self.levels, self.places, strict=True))])
 
     def with_student(self, number: int, student: Gaussians, camera: Camera, fixed: int) -> Gaussians:
         """The splats that the camera sees, with `student` in place of a level; its first `fixed` splats have no gradient."""
@@ -50,7 +50,7 @@ class Mixture:
         rows = (shown[self.places[number]] == number).nonzero()[:, 0]
         still, live = student[rows[rows < fixed]].detach(), student[rows[rows >= fixed]]
         others = [level[shown[self.places[k]] == k] for k, level in enumerate(self.levels) if k != number]
-        return together([*others, still, live])
+        return joined([*others, still, live])
 
     def part_of(self, number: int, live: Tensor, camera: Camera) -> Gaussians:
         """The splats that the camera sees, in white those of a level that are `live` [N], all others in black."""
@@ -60,9 +60,9 @@ class Mixture:
             here = shown[place] == k
             white = (live[here] if k == number else torch.zeros_like(here[here])).to(level.means)
             parts.append(replace(level[here], sh=((white - 0.5) / C0)[:, None, None].expand(-1, 1, 3)))
-        return together(parts)
+        return joined(parts)
 
 
-def together(parts: Sequence[Gaussians]) -> Gaussians:
+def joined(parts: Sequence[Gaussians]) -> Gaussians:
     """One set of splats from several of the same SH degree."""
     return Gaussians(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Gaussians) if field.name != "covariances"))

@@ -78,7 +78,7 @@ def is_unbounded(means: Tensor, views: Sequence[Camera], near: float) -> bool:
     return len(pixels) > 0 and bool(_quantile(pixels, 1 - NEAREST) > UNBOUNDED * _quantile(pixels, NEAREST))
 
 
-def focal(camera: Camera) -> float:
+def focal_along_shorter_side(camera: Camera) -> float:
     """The focal length in px along the shorter side, which the rule is about."""
     return camera.fx if camera.width <= camera.height else camera.fy
 

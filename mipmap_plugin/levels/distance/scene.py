@@ -22,7 +22,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance.chunks import Chunks
 from mipmap_plugin.levels.distance.coarsening import shaped
 from mipmap_plugin.levels.distance.rule import DistanceRule, nearest
-from mipmap_plugin.levels.distance.walks import backed, focal_of, foreground
+from mipmap_plugin.levels.distance.walks import backed, foreground, mean_focal
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.recipes import recipe as make_config
@@ -83,9 +83,9 @@ class DistanceScene:
 
     def unmade(self, finest: Gaussians, level: int) -> Gaussians:
         """A level that is not made yet, in closed form."""
-        size = self.rule.middle(level)
-        scales, opacities = shaped(finest, self.pixel_of(finest.means).clamp_max(size), size, self.target)
-        changes = self.pixel_of(finest.means) < size
+        size, pixels = self.rule.middle(level), self.pixel_of(finest.means)
+        scales, opacities = shaped(finest, pixels.clamp_max(size), size, self.target)
+        changes = pixels < size
         scales, opacities = torch.where(changes[:, None], scales, finest.scales), torch.where(changes, opacities, finest.opacities)
         return replace(finest, scales=scales, opacities=opacities)
 
@@ -93,6 +93,6 @@ class DistanceScene:
         """The `number`-th view, moved back so that the level is shown: two in three views by the whole way, each third by a part of it."""
         low, high = self.rule.ends(level)
         size = low * (high / low) ** ((number + 0.5) * GOLDEN % 1)
-        way = max(0.0, size * focal_of(view) - foreground(view, self.splats.means, self.target.near_plane))
+        way = max(0.0, size * mean_focal(view) - foreground(view, self.splats.means, self.target.near_plane))
         part = (number + 0.5) * GOLDEN**2 % 1 if number % 3 == 0 else 1.0
         return backed(view, part * way if math.isfinite(way) else 0.0)

@@ -88,10 +88,10 @@ class WalkTruth:
     def _scales(self, view: Camera, begin: Camera) -> Tensor:
         """[N], at most 1: how large each splat is, beside how large it was where the walk began, or in the closest training view."""
         now, then = (camera.to_camera(self._splats.means)[:, 2] for camera in (view, begin))
-        size = torch.maximum(then / focal_of(begin), self._pixels)
-        return (size * focal_of(view) / now.clamp_min(TINY)).clamp_max(1)
+        size = torch.maximum(then / mean_focal(begin), self._pixels)
+        return (size * mean_focal(view) / now.clamp_min(TINY)).clamp_max(1)
 
 
-def focal_of(camera: Camera) -> float:
+def mean_focal(camera: Camera) -> float:
     """The focal length in px, the mean of both."""
     return float((camera.fx * camera.fy) ** 0.5)

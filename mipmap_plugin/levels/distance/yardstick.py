@@ -16,7 +16,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance.mixture import Mixture
 from mipmap_plugin.levels.distance.rule import DistanceRule
 from mipmap_plugin.levels.distance.scene import DistanceScene
-from mipmap_plugin.levels.distance.walks import WalkTruth, backed, focal_of, foreground
+from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground, mean_focal
 from mipmap_plugin.levels.yardstick import DRAW, VIEWS
 from mipmap_plugin.limits import derived_seed
 from mipmap_plugin.models.base import SplatModel
@@ -75,7 +75,7 @@ class Walks:
         camera = backed(view, way)
         shown = self._mixture.splats(camera)
         truth, mixture, base = self._truth.make(camera, view), self._draw(shown, camera), self._draw(self._scene.splats, camera)
-        return Seen((depth + way) / focal_of(view), way, truth, mixture, base, len(shown))
+        return Seen((depth + way) / mean_focal(view), way, truth, mixture, base, len(shown))
 
     def sizes(self) -> list[float]:
         """Where walks are looked at, as rising sizes of a pixel at what is nearest: 0, where they begin, then the middle and the end of each level.
@@ -86,7 +86,7 @@ class Walks:
 
     def _way(self, view: Camera, size: float) -> float:
         """How far back, in world units, a pixel at what is nearest has this size; 0 where it has at least that as the walk begins."""
-        return max(0.0, size * focal_of(view) - self._depth(view, self._scene))
+        return max(0.0, size * mean_focal(view) - self._depth(view, self._scene))
 
     @staticmethod
     def _depth(view: Camera, scene: DistanceScene) -> float:

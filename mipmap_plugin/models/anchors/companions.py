@@ -6,9 +6,9 @@ from pathlib import Path
 
 # The files of a split checkpoint; those of NEEDED are required.
 FILES = {
-    **{"opacity_mlp": "opacity_mlp.pt", "cov_mlp": "cov_mlp.pt", "color_mlp": "color_mlp.pt"},
-    **{"feature_bank_mlp": "feature_bank_mlp.pt", "appearance": "embedding_appearance.pt"},
-}
+    "opacity_mlp": "opacity_mlp.pt", "cov_mlp": "cov_mlp.pt", "color_mlp": "color_mlp.pt",
+    "feature_bank_mlp": "feature_bank_mlp.pt", "appearance": "embedding_appearance.pt",
+}  # fmt: skip
 NEEDED = ("opacity_mlp", "cov_mlp", "color_mlp")
 
 # One file with all networks, the original's other format.

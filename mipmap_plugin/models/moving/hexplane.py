@@ -71,10 +71,7 @@ class HexPlane:
         raw = canonical.parameters()
         mask = changes.get("mask", raw["means"].new_ones(()))
         moved = dict(raw)
-        if (shift := changes.get("means")) is not None:
-            moved["means"] = raw["means"] * mask + shift
-        if (growth := changes.get("scales")) is not None:
-            moved["scales"] = raw["scales"] * mask + growth
+        moved |= {name: raw[name] * mask + changes[name] for name in ("means", "scales") if name in changes}
         if (turn := changes.get("quats")) is not None:
             moved["quats"] = quaternion_product(raw["quats"], turn) if self._options.get("apply_rotation") else raw["quats"] + turn
         if (fade := changes.get("opacities")) is not None:
