@@ -22,6 +22,9 @@ MAX_HEADER = 128 * 1024
 # Rows that are written at a time, so that a file is never in memory as a whole: 16 MB for splats of SH degree 3.
 WRITTEN_TOGETHER = 1 << 16
 
+# Other elements of a PLY that are named in a note.
+NAMED = 5
+
 BYTE_ORDER = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 TYPES = {
@@ -84,7 +87,7 @@ class PlyFile:
     columns: dict[str, np.ndarray]  # in file order, each [N], in the type and byte order of the file
     comments: tuple[str, ...]  # texts of `comment` and `obj_info` lines
     format: str  # a key of BYTE_ORDER
-    notes: tuple[str, ...] = ()  # faults that were tolerated, in sentences
+    notes: tuple[str, ...] = ()  # what was tolerated, and what is left out, in sentences
 
 
 def read_header(path: str | Path) -> Header:
@@ -108,7 +111,10 @@ def read_ply(path: str | Path) -> PlyFile:
     path = Path(path)
     header = read_header(path)
     rows = read_element(path, header, header.vertex)
-    return PlyFile({name: rows[name] for name in header.vertex.names}, header.comments, header.format, header.notes)
+    others = [element.name for element in header.elements if element.count and element.name != "vertex"]
+    named = ", ".join([*others[:NAMED], *["..."] * (len(others) > NAMED)])
+    notes = (f"beside its splats it holds {named}, which are left out of files that are made of it",) if others else ()
+    return PlyFile({name: rows[name] for name in header.vertex.names}, header.comments, header.format, (*header.notes, *notes))
 
 
 def read_element(path: Path, header: Header, element: Element) -> np.ndarray:
@@ -194,6 +200,9 @@ def _with_property(element: Element, words: list[str]) -> Element:
 def _sized(path: Path, header: Header, size: int) -> Header:
     """Compare the `size` bytes after the header with what it declares."""
     vertices = [element for element in header.elements if element.name == "vertex"]
+    if not vertices and header.elements and header.elements[0].name == "vertex_0":
+        by_degree = "has an element of splats for each SH degree (vertex_0, ...), as Reduced-3DGS writes them, which is not read here"
+        raise CheckpointError(f"{path} {by_degree}; give the PLY of another training of 3DGS")
     if not vertices:
         raise CheckpointError(f"{path} has no vertex element, so it holds no splats; its elements are {[e.name for e in header.elements]}")
     vertex = vertices[0]

@@ -12,28 +12,18 @@ from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import OF_SPLATS, Family, Files, Match
+from mipmap_plugin.models.others import OTHERS, PHOTOGRAPHS
 from mipmap_plugin.models.places import PARTS, REPORT, has_report
 from mipmap_plugin.models.zipped_folder import opened, retold, told
 
-# Suffixes of files of splats besides PLY, and of photographs.
-EXCHANGED, PHOTOGRAPHS = (".spz", ".sog", ".splat", ".ksplat", ".glb", ".gltf"), (".jpg", ".jpeg", ".png")
+# Suffixes of files of splats besides PLY.
+EXCHANGED = (".spz", ".sog", ".splat", ".ksplat", ".glb", ".gltf")
 OWN_SUFFIXES = (".ply", ".pt", ".ckpt", *EXCHANGED)
 
 # Columns of plain point clouds and meshes, among which are the points that a training starts from: input.ply, points3D.ply, sparse_pc.ply.
 OF_POINTS = frozenset(
     ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha", "s", "t", "u", "v", "flags", "quality", "confidence", "intensity")
 )
-
-# What else people give, by its suffix: what it is, and what to do.
-OTHERS = {
-    **dict.fromkeys((*PHOTOGRAPHS, ".mp4", ".mov"), "a photograph or a video, not a trained scene; train one on it first, and give that"),
-    **dict.fromkeys((".obj", ".fbx", ".stl", ".las", ".laz"), "a mesh or a plain point cloud, not Gaussian splats; give a trained model"),
-    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "USD, which is not read here; export a PLY from the program that made it"),
-    ".ssproj": "a project of SuperSplat, which moves and tints its splats; open it there and export a PLY",
-    ".npz": "a NumPy archive that no family knows; give a PLY file or a model folder, or register its family",
-    ".hier": "a hierarchy of Hierarchical 3D Gaussians, whose splats follow the distance, which is not read here; "
-    "give the PLY of one of its chunks (trained_chunks/<name>/point_cloud/iteration_<N>)",
-}
 
 # The families of this package.
 OWN = frozenset(family.name for family in BUILT_IN)

@@ -94,6 +94,9 @@ OTHERS = {
         for ending in ("usd", "usda", "usdc", "usdz")
     },
     "a.ssproj": (lambda path: archive(path, {"document.json": "{}"}), r"is a project of SuperSplat, .* export a PLY"),
+    "a.psht": (lambda path: path.write_bytes(bytes(range(7)) * 9), r"is a project of Postshot; .* export a PLY"),
+    "a.rad": (lambda path: path.write_bytes(b"RAD0" + bytes(range(7)) * 9), r"is RAD of Spark, .* the file that it was made from"),
+    "a.html": (lambda path: path.write_text("<!DOCTYPE html>\n<html>"), r"is a web page; if it shows a scene, .* export the scene as a PLY"),
     "merged.hier": (lambda path: path.write_bytes(bytes(range(7)) * 9), r"Hierarchical 3D Gaussians.*trained_chunks"),
 }
 
