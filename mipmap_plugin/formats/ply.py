@@ -22,6 +22,9 @@ MAX_HEADER = 128 * 1024
 # Rows that are written at a time, so that a file is never in memory as a whole: 16 MB for splats of SH degree 3.
 WRITTEN_TOGETHER = 1 << 16
 
+# What CloudCompare puts before the names of columns that it does not know, 3dgsconverter in files for CloudCompare, and both, one after the other.
+PREFIXES = ("scalar_scal_", "scalar_", "scal_")
+
 # Other elements of a PLY that are named in a note.
 NAMED = 5
 
@@ -103,7 +106,7 @@ def read_header(path: str | Path) -> Header:
     if end is None:
         raise CheckpointError(f"{path} has no end_header in its first {MAX_HEADER // 1024} kB: it is cut off or not a PLY; download it again")
     header = _parsed(path, head[first.end() : end.start()].split(newline), end.end())
-    return _sized(path, header, path.stat().st_size - end.end())
+    return _without_prefix(_sized(path, header, path.stat().st_size - end.end()))
 
 
 def read_ply(path: str | Path) -> PlyFile:
@@ -223,6 +226,18 @@ def _sized(path: Path, header: Header, size: int) -> Header:
         return header
     surplus = size - sum(element.count * element.stride for element in header.elements)
     return _with_surplus(path, header, surplus) if surplus > 0 else header
+
+
+def _without_prefix(header: Header) -> Header:
+    """The header with the names that columns of splats had before CloudCompare put a prefix before them."""
+    vertex = header.vertex
+    prefix = next((each for each in PREFIXES if f"{each}f_dc_0" in vertex.names and "f_dc_0" not in vertex.names), None)
+    if prefix is None:
+        return header
+    shorter = ((name.removeprefix(prefix), name, kind) for name, kind in vertex.properties)
+    fixed = replace(vertex, properties=tuple((name if short in vertex.names else short, kind) for short, name, kind in shorter))
+    note = f"its columns have names that CloudCompare gives them ({prefix}f_dc_0 and others); they are read as those of 3DGS"
+    return replace(header, elements=tuple(fixed if element is vertex else element for element in header.elements), notes=(*header.notes, note))
 
 
 def _with_surplus(path: Path, header: Header, surplus: int) -> Header:

@@ -100,6 +100,22 @@ def test_elements_that_are_left_out_are_told_of(tmp_path):
     assert note == "beside its splats it holds e0, e1, e2, e3, e4, ..., which are left out of files that are made of it"
 
 
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("prefix", ["scalar_", "scal_", "scalar_scal_"])
+def test_columns_that_cloudcompare_named_have_their_own_names(tmp_path, prefix, form):
+    columns = splat_columns(3)
+    kept = ("x", "y", "z", "nx", "ny", "nz")
+    file = read_ply(write(tmp_path / "a.ply", {name if name in kept else prefix + name: column for name, column in columns.items()}, form))
+    assert list(file.columns) == list(columns)
+    np.testing.assert_array_equal(file.columns["rot_3"], columns["rot_3"])
+    assert f"CloudCompare gives them ({prefix}f_dc_0 and others)" in file.notes[0]
+
+
+def test_a_column_keeps_a_prefix_whose_name_is_taken(tmp_path):
+    columns = {"x": np.zeros(2, np.float32), "scalar_x": np.ones(2, np.float32), "scalar_f_dc_0": np.ones(2, np.float32)}
+    assert list(read_ply(write(tmp_path / "a.ply", columns)).columns) == ["x", "scalar_x", "f_dc_0"]
+
+
 def test_misdeclared_colors_of_nerfstudio_are_read_as_rgb(tmp_path):
     text = header("format binary_little_endian 1.0", "element vertex 2", "property uchar colors", "property uchar opacity", "end_header")
     (tmp_path / "a.ply").write_bytes(text + bytes([1, 2, 3, 9, 4, 5, 6, 8]))
