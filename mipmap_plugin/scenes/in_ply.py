@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from mipmap_plugin.camera import OPENGL_TO_OPENCV, Camera
 from mipmap_plugin.errors import MipmapPluginError, SceneError
 from mipmap_plugin.formats.ply import Header, read_element, read_header
@@ -21,9 +23,10 @@ MODELS, ORTHOGRAPHIC = "camera_models", 5
 def cameras_in(ply: str | Path | None) -> list[Camera]:
     """The cameras in a PLY, by its elements. Empty for any other file. Raises SceneError for a camera that is none.
 
-    SHARP's: `intrinsic` (3 x 3), `extrinsic` (4 x 4, from the world to the camera) and `image_size` (width, height); ml-sharp,
-    src/sharp/utils/gaussians.py, `save_ply`. fVDB's: `camera_to_world_matrices` (N x 4 x 4, OpenCV's axes), `projection_matrices` (N x 3 x 3, px) and
-    `image_sizes` (N x 2: height, width); openvdb/fvdb-reality-capture, `reconstruction_metadata`.
+    SHARP's: `intrinsic` (3 x 3), `image_size` (width, height) and `extrinsic` (4 x 4, from the world to the camera; without it, as its ports to
+    browsers write none, the camera is at the origin); ml-sharp, src/sharp/utils/gaussians.py, `save_ply`, `load_ply`. fVDB's:
+    `camera_to_world_matrices` (N x 4 x 4, OpenCV's axes), `projection_matrices` (N x 3 x 3, px) and `image_sizes` (N x 2: height, width);
+    openvdb/fvdb-reality-capture, `reconstruction_metadata`.
     """
     if ply is None or not Path(ply).is_file():
         return []
@@ -38,11 +41,12 @@ def cameras_in(ply: str | Path | None) -> list[Camera]:
 
 
 def _of_sharp(ply: Path, header: Header) -> list[Camera]:
-    if any(_rows(header, name, name) != count for name, count in ROWS.items()):
+    held = {name for name in ROWS if any(element.name == name for element in header.elements)}
+    if not {"intrinsic", "image_size"} <= held or any(_rows(header, name, name) != ROWS[name] for name in held):
         return []
-    intrinsic, extrinsic, size = (_values(ply, header, name) for name in ROWS)
-    pose, matrix = extrinsic.reshape(4, 4).astype(float), intrinsic.reshape(3, 3).astype(float)
-    return [Camera.of_matrices(pose, matrix, *size.tolist(), name="photograph")]
+    intrinsic, size = (_values(ply, header, name) for name in ("intrinsic", "image_size"))
+    pose = _values(ply, header, "extrinsic").reshape(4, 4).astype(float) if "extrinsic" in held else torch.eye(4)
+    return [Camera.of_matrices(pose, intrinsic.reshape(3, 3).astype(float), *size.tolist(), name="photograph")]
 
 
 def _of_fvdb(ply: Path, header: Header) -> list[Camera]:
