@@ -12,7 +12,7 @@ from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import OF_SPLATS, Family, Files, Match
-from mipmap_plugin.models.others import OTHERS, PHOTOGRAPHS
+from mipmap_plugin.models.others import OTHERS, PHOTOGRAPHS, UNREAD
 from mipmap_plugin.models.places import PARTS, REPORT, has_report
 from mipmap_plugin.models.zipped_folder import opened, retold, told
 
@@ -162,7 +162,8 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
         raise CheckpointError(f"{folder} has no point_cloud/iteration_{iteration}; give the model folder above it, or no iteration")
     files = sorted(folder.iterdir())
     clouds = [file for file in files if file.suffix.lower() == ".ply" and not _holds_points(file)]
-    clouds = clouds or [file for file in files if file.suffix.lower() in EXCHANGED and file.is_file()]
+    for endings in (EXCHANGED, UNREAD):
+        clouds = clouds or [file for file in files if file.suffix.lower() in endings and file.is_file()]
     clouds = [cloud for cloud in clouds if not has_report(cloud)] or clouds  # no adaptations, where there is a base
     if len(clouds) > 1 and folder / "point_cloud.ply" in clouds:
         clouds = [folder / "point_cloud.ply"]

@@ -2,6 +2,9 @@
 
 PHOTOGRAPHS = (".jpg", ".jpeg", ".png")
 
+# Files of splats that are not read, each of which has a sentence of its own.
+UNREAD = (".lcc", ".lcc2", ".ssproj", ".psht", ".rad")
+
 # What else people give, by its suffix: what it is, and what to do.
 OTHERS = {
     **dict.fromkeys((*PHOTOGRAPHS, ".mp4", ".mov"), "a photograph or a video, not a trained scene; train one on it first, and give that"),
