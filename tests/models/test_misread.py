@@ -109,6 +109,14 @@ def test_a_file_of_another_project_has_its_own_sentence(tmp_path, name):
         load_model(tmp_path / name)
 
 
+@pytest.mark.parametrize(("without", "lacks"), [(("opacity",), "opacity"), (("scale_0", "rot_0"), "rot_0, scale_0")])
+def test_splats_without_some_of_their_columns_are_no_point_cloud(tmp_path, without, lacks):
+    """Some programs call them scaling_0 and rotation_0."""
+    columns = {f"other_{name}" if name in without else name: column for name, column in COLUMNS.items()}
+    with pytest.raises(CheckpointError, match=f"is no whole 3DGS checkpoint: it lacks the columns {lacks}; export it again with them"):
+        load_model(write(tmp_path / "a.ply", columns))
+
+
 @pytest.mark.parametrize("place", [".", "meta.json"])
 def test_pictures_of_gsplat_have_their_own_sentence(tmp_path, place):
     facts = {name: {"shape": [4, 3], "dtype": "float32", "mins": [0, 0, 0], "maxs": [1, 1, 1]} for name in ("means", "scales", "quats")}
