@@ -76,7 +76,7 @@ class Session:
         self._closest_of = cameras if scale > 1 and cameras else self.base_views  # a zoom-in is as fine as what the base was seen from
         self.views = over_band(self.base_views, config)
         self.views_note += f", {photographs.note(self.base_views)}" if photographs else ""
-        steering, choosing = (over_band(half, config) for half in (validation[::2], validation[1::2]))
+        steering, choosing = (over_band(half, config) for half in (validation[::2], validation[1::2] or validation))
         request.images.keep_only([*self.views, *steering, *choosing])
         self.truth = PseudoTruth(request.images, scale, config, photographs)
         self.detail = DetailLoss(self.truth, scale, config) if scale > 1 and config.compare_at == "both" and config.steps else None

@@ -52,6 +52,8 @@ def _refuse_placeholder(path: Path, head: bytes) -> None:
         target = f" of a file of {int(size[1]):,} bytes" if size else ""
         raise CheckpointError(f"{path} is only the Git-LFS pointer{target}; run `git lfs pull` in its repository")
     if start.startswith((b"<!doctype", b"<html", b"<?xml")):
+        if path.suffix.lower() in (".html", ".htm"):
+            raise CheckpointError(f"{path} is a web page; if it shows a scene, as SuperSplat exports them, export the scene as a PLY")
         raise CheckpointError(f"{path} is a web page, so the download went wrong; download it again")
     if start.startswith((b'{"error', b'{"message', b'{"status')):
         raise CheckpointError(f"{path} is a server's error message, so the download went wrong; download it again")

@@ -22,6 +22,12 @@ MAX_HEADER = 128 * 1024
 # Rows that are written at a time, so that a file is never in memory as a whole: 16 MB for splats of SH degree 3.
 WRITTEN_TOGETHER = 1 << 16
 
+# What CloudCompare puts before the names of columns that it does not know, 3dgsconverter in files for CloudCompare, and both, one after the other.
+PREFIXES = ("scalar_scal_", "scalar_", "scal_")
+
+# Other elements of a PLY that are named in a note.
+NAMED = 5
+
 BYTE_ORDER = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 TYPES = {
@@ -84,7 +90,7 @@ class PlyFile:
     columns: dict[str, np.ndarray]  # in file order, each [N], in the type and byte order of the file
     comments: tuple[str, ...]  # texts of `comment` and `obj_info` lines
     format: str  # a key of BYTE_ORDER
-    notes: tuple[str, ...] = ()  # faults that were tolerated, in sentences
+    notes: tuple[str, ...] = ()  # what was tolerated, and what is left out, in sentences
 
 
 def read_header(path: str | Path) -> Header:
@@ -100,7 +106,7 @@ def read_header(path: str | Path) -> Header:
     if end is None:
         raise CheckpointError(f"{path} has no end_header in its first {MAX_HEADER // 1024} kB: it is cut off or not a PLY; download it again")
     header = _parsed(path, head[first.end() : end.start()].split(newline), end.end())
-    return _sized(path, header, path.stat().st_size - end.end())
+    return _without_prefix(_sized(path, header, path.stat().st_size - end.end()))
 
 
 def read_ply(path: str | Path) -> PlyFile:
@@ -108,7 +114,10 @@ def read_ply(path: str | Path) -> PlyFile:
     path = Path(path)
     header = read_header(path)
     rows = read_element(path, header, header.vertex)
-    return PlyFile({name: rows[name] for name in header.vertex.names}, header.comments, header.format, header.notes)
+    others = [element.name for element in header.elements if element.count and element.name != "vertex"]
+    named = ", ".join([*others[:NAMED], *["..."] * (len(others) > NAMED)])
+    notes = (f"beside its splats it holds {named}, which are left out of files that are made of it",) if others else ()
+    return PlyFile({name: rows[name] for name in header.vertex.names}, header.comments, header.format, (*header.notes, *notes))
 
 
 def read_element(path: Path, header: Header, element: Element) -> np.ndarray:
@@ -200,6 +209,9 @@ def _with_property(element: Element, words: list[str]) -> Element:
 def _sized(path: Path, header: Header, size: int) -> Header:
     """Compare the `size` bytes after the header with what it declares."""
     vertices = [element for element in header.elements if element.name == "vertex"]
+    if not vertices and header.elements and header.elements[0].name == "vertex_0":
+        by_degree = "has an element of splats for each SH degree (vertex_0, ...), as Reduced-3DGS writes them, which is not read here"
+        raise CheckpointError(f"{path} {by_degree}; give the PLY of another training of 3DGS")
     if not vertices:
         raise CheckpointError(f"{path} has no vertex element, so it holds no splats; its elements are {[e.name for e in header.elements]}")
     vertex = vertices[0]
@@ -220,6 +232,18 @@ def _sized(path: Path, header: Header, size: int) -> Header:
         return header
     surplus = size - sum(element.count * element.stride for element in header.elements)
     return _with_surplus(path, header, surplus) if surplus > 0 else header
+
+
+def _without_prefix(header: Header) -> Header:
+    """The header with the names that columns of splats had before CloudCompare put a prefix before them."""
+    vertex = header.vertex
+    prefix = next((each for each in PREFIXES if f"{each}f_dc_0" in vertex.names and "f_dc_0" not in vertex.names), None)
+    if prefix is None:
+        return header
+    shorter = ((name.removeprefix(prefix), name, kind) for name, kind in vertex.properties)
+    fixed = replace(vertex, properties=tuple((name if short in vertex.names else short, kind) for short, name, kind in shorter))
+    note = f"its columns have names that CloudCompare gives them ({prefix}f_dc_0 and others); they are read as those of 3DGS"
+    return replace(header, elements=tuple(fixed if element is vertex else element for element in header.elements), notes=(*header.notes, note))
 
 
 def _with_surplus(path: Path, header: Header, surplus: int) -> Header:

@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from mipmap_plugin.formats import fvdb
 from mipmap_plugin.screen_filters import COMPENSATED, SCREEN_FILTERS
 
 PROVENANCE = "mipmap_plugin"
@@ -116,7 +117,7 @@ def with_tags(comments: Iterable[str], screen_filter: str, provenance: dict[str,
     tags += [f"SplatRenderMode: {tag}"] if tag else []
     if eps2d is not None and (screen_filter == "mip" or tag is None):
         provenance = {**provenance, "screen_filter": screen_filter, "kernel_size": eps2d}  # which the tag does not tell
-    return [*foreign, *tags, f"{PROVENANCE} {json.dumps(provenance, default=str)}"]
+    return [*fvdb.rewritten(foreign, screen_filter, eps2d), *tags, f"{PROVENANCE} {json.dumps(provenance, default=str)}"]
 
 
 def provenance_of(comments: Iterable[str]) -> dict[str, Any] | None:
@@ -132,12 +133,14 @@ def provenance_of(comments: Iterable[str]) -> dict[str, Any] | None:
 
 
 def recorded_filter(comments: Iterable[str]) -> tuple[str, float] | None:
-    """Name and dilation (px²) of the screen filter that the provenance records where no tag tells both; None without a record.
+    """Name and dilation (px²) of the screen filter that the provenance records where no tag tells both, or fVDB's settings; None without either.
 
     A tag that another program wrote since counts for more: with that of 3DGS there is None.
     """
     comments = list(comments)
     record, mode = provenance_of(comments) or {}, render_mode(comments)
+    if not record and mode is None:
+        return fvdb.filter_of(comments)
     size, name = record.get("kernel_size"), record.get("screen_filter", "mip")  # older versions record no name
     if not isinstance(name, str) or name not in SCREEN_FILTERS or mode != _MODES.get(_TAGS.get(name, "")):
         return None

@@ -19,6 +19,9 @@ SH_DEGREES = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
 # Opacities keep this distance from 0 and 1, whose logits are infinite: far below one step of 8 bits, yet resolved by float32.
 OPACITY_MARGIN = 1e-6
 
+# Whole numbers of 8 and 16 bits, which are no logarithms, coefficients or quaternions, but stand for them.
+CODES = ("i1", "u1", "i2", "u2")
+
 # Floats above this are no colors in 0..1, not even of lights.
 BRIGHTEST = 16
 
@@ -40,12 +43,15 @@ def to_parameters(columns: Mapping[str, np.ndarray], path: Path) -> dict[str, Te
     """Raw float32 parameters, with gsplat's names and shapes.
 
     means [N, 3], scales [N, 3] log, quats [N, 4] wxyz, opacities [N] logit, sh0 [N, 1, 3], shN [N, K, 3] basis-major.
-    Raises CheckpointError for missing columns and for a number of f_rest columns that fits no SH degree.
+    Raises CheckpointError for missing columns, for codes in place of values, and for a number of f_rest columns that fits no SH degree.
     """
     columns = _with_logits(_with_dc(_with_halves(columns)))
     if missing := [name for name in NEEDED if name not in columns]:
         raise CheckpointError(f"{path} is no 3DGS checkpoint: it lacks the columns {', '.join(missing)}; export it again with them")
     rest = rest_names(columns)
+    if codes := [name for name in (*DC, *rest, *SCALE, *QUATERNION) if columns[name].dtype.str[1:] in CODES]:
+        why = f"its column {codes[0]} holds whole numbers of {8 * columns[codes[0]].dtype.itemsize} bits, whose meaning it does not say"
+        raise CheckpointError(f"{path} is quantized by a program that is not known here: {why}; export it again as floats")
     if len(rest) not in SH_DEGREES:
         raise CheckpointError(f"{path} has {len(rest)} f_rest columns, which fit no SH degree: 0, 9, 24, 45 or 72 do; export it again")
     bands = len(rest) // 3

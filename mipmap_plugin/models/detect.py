@@ -11,7 +11,8 @@ from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import OF_SPLATS, Family, Files, Match
-from mipmap_plugin.models.folders import PHOTOGRAPHS, checkpoints_in, holds_points, is_model_folder, meant_instead, model_folders_below
+from mipmap_plugin.models.folders import checkpoints_in, holds_points, is_model_folder, meant_instead, model_folders_below
+from mipmap_plugin.models.others import OTHERS, UNREAD
 from mipmap_plugin.models.places import PARTS, has_report
 from mipmap_plugin.models.zipped_folder import retold, unzipped, with_archives_named
 
@@ -19,16 +20,6 @@ from mipmap_plugin.models.zipped_folder import retold, unzipped, with_archives_n
 EXCHANGED = (".spz", ".sog", ".splat", ".ksplat", ".glb", ".gltf")
 OWN_SUFFIXES = (".ply", ".pt", ".ckpt", *EXCHANGED)
 
-# What else people give, by its suffix: what it is, and what to do.
-OTHERS = {
-    **dict.fromkeys((*PHOTOGRAPHS, ".mp4", ".mov"), "a photograph or a video, not a trained scene; train one on it first, and give that"),
-    **dict.fromkeys((".obj", ".fbx", ".stl", ".las", ".laz"), "a mesh or a plain point cloud, not Gaussian splats; give a trained model"),
-    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "USD, which is not read here; export a PLY from the program that made it"),
-    ".ssproj": "a project of SuperSplat, which moves and tints its splats; open it there and export a PLY",
-    ".npz": "a NumPy archive that no family knows; give a PLY file or a model folder, or register its family",
-    ".hier": "a hierarchy of Hierarchical 3D Gaussians, whose splats follow the distance, which is not read here; "
-    "give the PLY of one of its chunks (trained_chunks/<name>/point_cloud/iteration_<N>)",
-}
 
 # The families of this package.
 OWN = frozenset(family.name for family in BUILT_IN)
@@ -167,7 +158,8 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
         raise CheckpointError(f"{folder} has no point_cloud/iteration_{iteration}; give the model folder above it, or no iteration")
     files = sorted(folder.iterdir())
     clouds = [file for file in files if file.suffix.lower() == ".ply" and not holds_points(file)]
-    clouds = clouds or [file for file in files if file.suffix.lower() in EXCHANGED and file.is_file()]
+    for endings in (EXCHANGED, UNREAD):
+        clouds = clouds or [file for file in files if file.suffix.lower() in endings and file.is_file()]
     clouds = [cloud for cloud in clouds if not has_report(cloud)] or clouds  # no adaptations, where there is a base
     if len(clouds) > 1 and folder / "point_cloud.ply" in clouds:
         clouds = [folder / "point_cloud.ply"]

@@ -9,10 +9,8 @@ from pathlib import Path
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.models.families import FAMILIES, find_family
 from mipmap_plugin.models.family import Family, Files
+from mipmap_plugin.models.others import PHOTOGRAPHS
 from mipmap_plugin.models.places import REPORT
-
-# Suffixes of photographs.
-PHOTOGRAPHS = (".jpg", ".jpeg", ".png")
 
 # Columns of plain point clouds and meshes, among which are the points that a training starts from: input.ply, points3D.ply, sparse_pc.ply.
 OF_POINTS = frozenset(

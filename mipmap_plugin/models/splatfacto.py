@@ -190,6 +190,10 @@ def _unusual_options(pipeline: Mapping[str, Any], options: dict[str, Any]) -> li
     if not options:
         advice = "if it was antialiased, say so (--screen-filter antialiased)"
         notes.append(f"config.yml is not beside the checkpoint, so that it is taken to be trained with the classic screen filter; {advice}")
+    named = [re.search(r"gauss_params\.(\w+)$", str(key)) for key in pipeline]
+    if more := [name[1] for name in named if name and name[1] not in NAMES]:
+        stale = "adapted checkpoints keep those of the base, and only open where no splats were merged or left out; --viewer writes a PLY"
+        notes.append(f"its splats also have {', '.join(more)}, which splatfacto's have not: {stale}")
     if any(str(key).endswith("camera_optimizer.pose_adjustment") for key in pipeline):
         notes.append("the training moved its cameras (camera_optimizer); the cameras of the scene are rendered as they are given")
     if options.get("use_bilateral_grid"):

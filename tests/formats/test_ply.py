@@ -15,6 +15,9 @@ def header(*lines: str) -> bytes:
     return "\n".join(["ply", *lines, ""]).encode()
 
 
+F4 = "property float x"
+
+
 @pytest.mark.parametrize("newline", ["\n", "\r", "\r\n"])
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_reads_every_encoding_alike(tmp_path, form, newline):
@@ -89,6 +92,30 @@ def test_surplus_bytes_are_tolerated_with_a_note(tmp_path):
     assert "3 bytes more" in file.notes[0]
 
 
+def test_elements_that_are_left_out_are_told_of(tmp_path):
+    others = [f"element e{i} 1" for i in range(7)]
+    text = header("format ascii 1.0", "element face 0", F4, "element vertex 1", F4, *(part for each in others for part in (each, F4)), "end_header")
+    (tmp_path / "a.ply").write_bytes(text + b"1\n" * 8)
+    [note] = read_ply(tmp_path / "a.ply").notes
+    assert note == "beside its splats it holds e0, e1, e2, e3, e4, ..., which are left out of files that are made of it"
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("prefix", ["scalar_", "scal_", "scalar_scal_"])
+def test_columns_that_cloudcompare_named_have_their_own_names(tmp_path, prefix, form):
+    columns = splat_columns(3)
+    kept = ("x", "y", "z", "nx", "ny", "nz")
+    file = read_ply(write(tmp_path / "a.ply", {name if name in kept else prefix + name: column for name, column in columns.items()}, form))
+    assert list(file.columns) == list(columns)
+    np.testing.assert_array_equal(file.columns["rot_3"], columns["rot_3"])
+    assert f"CloudCompare gives them ({prefix}f_dc_0 and others)" in file.notes[0]
+
+
+def test_a_column_keeps_a_prefix_whose_name_is_taken(tmp_path):
+    columns = {"x": np.zeros(2, np.float32), "scalar_x": np.ones(2, np.float32), "scalar_f_dc_0": np.ones(2, np.float32)}
+    assert list(read_ply(write(tmp_path / "a.ply", columns)).columns) == ["x", "scalar_x", "f_dc_0"]
+
+
 def test_misdeclared_colors_of_nerfstudio_are_read_as_rgb(tmp_path):
     text = header("format binary_little_endian 1.0", "element vertex 2", "property uchar colors", "property uchar opacity", "end_header")
     (tmp_path / "a.ply").write_bytes(text + bytes([1, 2, 3, 9, 4, 5, 6, 8]))
@@ -96,7 +123,6 @@ def test_misdeclared_colors_of_nerfstudio_are_read_as_rgb(tmp_path):
     assert {name: column.tolist() for name, column in columns.items()} == {"red": [1, 4], "green": [2, 5], "blue": [3, 6], "opacity": [9, 8]}
 
 
-F4 = "property float x"
 MALFORMED = {
     "empty": (b"", "is empty"),
     "lfs": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 12345678\n", r"12,345,678 bytes; run `git lfs pull`"),
@@ -117,6 +143,10 @@ MALFORMED = {
     "negative": (header("format ascii 1.0", "element vertex -1", F4, "end_header"), "line 3 .* cannot be read"),
     "no count": (header("format ascii 1.0", "element vertex", F4, "end_header"), "line 3 .* cannot be read"),
     "no vertex": (header("format ascii 1.0", "element face 1", F4, "end_header") + b"1\n", "no vertex element"),
+    "by degree": (
+        header("format ascii 1.0", "element vertex_0 1", F4, "element vertex_1 1", F4, "end_header") + b"1\n2\n",
+        r"an element of splats for each SH degree \(vertex_0, ...\), as Reduced-3DGS writes",
+    ),
     "two vertex": (
         header("format ascii 1.0", "element vertex 1", F4, "element face 1", F4, "element vertex 2", F4, "end_header") + b"1\n2\n3\n4\n",
         "has 2 vertex elements, and 2 rows would be lost; export the file again with one element",

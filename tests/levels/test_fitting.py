@@ -2,16 +2,19 @@
 
 import json
 import re
+import zlib
 
 import gltf_files
 import pytest
 import tiny
+import torch
 
 from mipmap_plugin import cli, load_model
 from mipmap_plugin.commands.types import read_size
 from mipmap_plugin.errors import OutputError, SettingsError
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.levels.fitting import ARCHIVE, UNKNOWN, fitting_scale, recorded, splats_within
+from mipmap_plugin.models import contract
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.recipes import recipe, scale_of_fraction
 from mipmap_plugin.wrap import wrap_model
@@ -139,3 +142,18 @@ def test_a_file_of_few_splats_is_compared_with_the_base(tmp_path, capsys):
     assert cli.main([*words[:-1], "--overwrite"]) == 0
     before, after = re.search(r"x1: ([0-9.]+) -> ([0-9.]+) dB", capsys.readouterr().out).groups()
     assert float(before) > float(after)
+
+
+def test_what_a_format_rounded_counts_as_it_will_be_written(tmp_path, monkeypatch):
+    """A base out of a compressed file compresses better than what is made of it."""
+
+    def save(model, path, record):
+        path.write_bytes(zlib.compress((model.parameters()["shN"].detach() * 128).round().to(torch.int8).numpy().tobytes()))
+        return path
+
+    monkeypatch.setattr(contract, "save", save)
+    fine = tiny.model(3000, degree=3)
+    coarse = VanillaModel({**fine.parameters(), "shN": (16 * fine.parameters()["shN"]).round() / 16})
+    most = splats_within(coarse, 40_000, "phone.spz", {})
+    kept = fine.keep_rows(torch.arange(3000) < most)
+    assert 30_000 < save(kept, tmp_path / "a.spz", {}).stat().st_size <= 40_000

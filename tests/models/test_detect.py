@@ -140,8 +140,11 @@ def test_a_splat_file_may_have_quaternions_of_any_length_and_sizes_of_zero(tmp_p
 
 def test_a_capture_in_lcc_is_converted_first(tmp_path):
     (tmp_path / "hall.lcc").write_text('{"version": "5.0", "source": "lcc", "totalSplats": 9}')
-    with pytest.raises(CheckpointError, match=r"hall.lcc is LCC of XGRIDS, which is not read here; convert it: splat-transform hall.lcc hall.ply"):
-        detect(tmp_path / "hall.lcc")
+    (tmp_path / "data.bin").write_bytes(bytes(99))
+    sentence = "hall.lcc is LCC of XGRIDS, which is not read here; convert it: splat-transform hall.lcc hall.ply"
+    for given in tmp_path / "hall.lcc", tmp_path:
+        with pytest.raises(CheckpointError, match=sentence):
+            detect(given)
 
 
 @pytest.mark.parametrize(

@@ -94,6 +94,9 @@ OTHERS = {
         for ending in ("usd", "usda", "usdc", "usdz")
     },
     "a.ssproj": (lambda path: archive(path, {"document.json": "{}"}), r"is a project of SuperSplat, .* export a PLY"),
+    "a.psht": (lambda path: path.write_bytes(bytes(range(7)) * 9), r"is a project of Postshot; .* export a PLY"),
+    "a.rad": (lambda path: path.write_bytes(b"RAD0" + bytes(range(7)) * 9), r"is RAD of Spark, .* the file that it was made from"),
+    "a.html": (lambda path: path.write_text("<!DOCTYPE html>\n<html>"), r"is a web page; if it shows a scene, .* export the scene as a PLY"),
     "merged.hier": (lambda path: path.write_bytes(bytes(range(7)) * 9), r"Hierarchical 3D Gaussians.*trained_chunks"),
 }
 
@@ -104,6 +107,14 @@ def test_a_file_of_another_project_has_its_own_sentence(tmp_path, name):
     make(tmp_path / name)
     with pytest.raises(CheckpointError, match=sentence):
         load_model(tmp_path / name)
+
+
+@pytest.mark.parametrize(("without", "lacks"), [(("opacity",), "opacity"), (("scale_0", "rot_0"), "rot_0, scale_0")])
+def test_splats_without_some_of_their_columns_are_no_point_cloud(tmp_path, without, lacks):
+    """Some programs call them scaling_0 and rotation_0."""
+    columns = {f"other_{name}" if name in without else name: column for name, column in COLUMNS.items()}
+    with pytest.raises(CheckpointError, match=f"is no whole 3DGS checkpoint: it lacks the columns {lacks}; export it again with them"):
+        load_model(write(tmp_path / "a.ply", columns))
 
 
 @pytest.mark.parametrize("place", [".", "meta.json"])

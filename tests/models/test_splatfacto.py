@@ -176,6 +176,11 @@ def test_notes_name_what_is_not_applied(tmp_path):
     assert "bilateral grid" in load_model(splatfacto_folder(tmp_path / "r", splats(), grid="true")).notes[0]
 
 
+def test_what_its_splats_have_beyond_those_of_splatfacto_is_told_of(tmp_path):
+    torch.save(splatfacto_content({**splatfacto_state(splats()), "_model.gauss_params.normals": torch.zeros(3, 3)}), tmp_path / "a.ckpt")
+    assert any(note.startswith("its splats also have normals, which splatfacto's have not: ") for note in load_model(tmp_path / "a.ckpt").notes)
+
+
 @pytest.mark.parametrize(
     ("pipeline", "sentence"),
     [

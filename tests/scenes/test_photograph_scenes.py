@@ -24,11 +24,11 @@ INTRINSIC = (40.0, 0.0, 16.0, 0.0, 40.0, 12.0, 0.0, 0.0, 1.0)
 EXTRINSIC = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]])  # the splats lie around the origin
 
 
-def sharp(path, intrinsic=INTRINSIC, size=(32, 24), *, text=False):
-    """A PLY as SHARP writes it, of the tiny splats."""
+def sharp(path, intrinsic=INTRINSIC, size=(32, 24), *, text=False, without=()):
+    """A PLY as SHARP writes it, of the tiny splats. `without`: elements that are left out."""
     sizes = np.float32(size) if isinstance(size[0], float) else np.uint32(size)
     more = {"extrinsic": np.float32(EXTRINSIC.flatten()), "intrinsic": np.float32(intrinsic), "image_size": sizes}
-    elements = [PlyElement.describe(values.view([(name, values.dtype)]), name) for name, values in more.items()]
+    elements = [PlyElement.describe(values.view([(name, values.dtype)]), name) for name, values in more.items() if name not in without]
     PlyData([PlyData.read(tiny.ply(path.with_suffix(".plain.ply")))["vertex"], *elements], text=text).write(path)
     return path
 
@@ -39,6 +39,13 @@ def test_the_camera_is_that_of_the_photograph(tmp_path, text):
     assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (32, 24, 40, 40, 16, 12)
     assert torch.equal(camera.viewmat, EXTRINSIC.double())
     assert [each.fx for each in load_scene(tmp_path / "photo.ply").cameras] == [40.0]
+
+
+def test_without_a_pose_the_camera_is_at_the_origin(tmp_path):
+    """As for SHARP's own loader: what its ports to browsers write has none."""
+    [camera] = cameras_in(sharp(tmp_path / "photo.ply", without=("extrinsic",)))
+    assert torch.equal(camera.viewmat, torch.eye(4, dtype=torch.float64)) and camera.fx == 40.0
+    assert cameras_in(sharp(tmp_path / "sizeless.ply", without=("image_size",))) == []
 
 
 @pytest.mark.parametrize("scale", [1 / 2, 2])

@@ -9,6 +9,7 @@ import tiny
 import torch
 from equal_models import SCALE
 
+from mipmap_plugin.adaptation import session
 from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR
 from mipmap_plugin.adaptation.optimization.validation import TIE_DB, VALIDATION_EVERY, VISIBLE_ERROR, WINDOW, Validation, split_validation
 from mipmap_plugin.adaptation.viewpoints import Viewpoints
@@ -94,6 +95,13 @@ def test_a_window_has_whole_blocks_where_its_view_has(pixels):
     _, judged = held_back(views, "given", 1 / pixels)
     assert judged and all(side <= WINDOW for view in judged for side in view.size)
     assert all(side % small == 0 for view in judged for side, small in zip(view.size, view.zoomed(1 / pixels).size, strict=True))
+
+
+def test_a_single_view_both_steers_and_chooses(monkeypatch):
+    """Where only one view sees a scene clearly, what is no better than the base in it is still not returned."""
+    monkeypatch.setattr(session, "split_validation", lambda cameras, views, *others: (list(views), tiny.cameras(1)))
+    report = tiny.wrapped(tiny.gaussians()).adapt(SCALE, cameras=tiny.cameras(4), steps=1).report
+    assert "the base as it is" in report.validation and "not validated" not in report.returned
 
 
 def test_where_one_pixel_of_the_base_is_more_than_is_judged_nothing_is():

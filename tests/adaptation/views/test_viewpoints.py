@@ -14,7 +14,7 @@ from lone_capture import capture
 from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation.optimization.amount import DRAWS_A_SECOND, FOR_LOOKS, looks_in_budget
 from mipmap_plugin.adaptation.optimization.validation import split_validation
-from mipmap_plugin.adaptation.viewpoints import FOG, LEAST_LOOKS, ROUNDS, ClearViews, Viewpoints
+from mipmap_plugin.adaptation.viewpoints import FOG, LEAST_LOOKS, TRIED, ClearViews, Viewpoints
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
@@ -44,9 +44,16 @@ def test_views_of_a_capture_are_clear_and_as_many_as_are_wanted():
 def test_where_few_are_clear_there_are_few_and_where_none_is_there_are_all():
     tried = []
     [found] = views_of(CAPTURE, lambda view: tried.append(view.name) or view.name == f"orbit_{2 * COUNT:04d}")
-    assert found.name in tried and len(set(tried)) == ROUNDS * COUNT
+    assert found.name in tried and len(set(tried)) == math.ceil(TRIED / COUNT) * COUNT
     with pytest.warns(UserWarning, match="no generated view that was looked at sees this capture clearly"):
         assert len(views_of(CAPTURE, lambda view: False)) == COUNT
+
+
+def test_of_few_views_two_are_looked_for_longer():
+    """One to steer by, and one to choose by: of the first 24 views that validation with six would try only one is clear."""
+    tried = []
+    found = views_of(CAPTURE, lambda view: tried.append(view.name) or int(view.name.removeprefix("orbit_")) in (3, 50, 51, 90), count=6)
+    assert [view.name for view in found] == ["orbit_0003", "orbit_0050", "orbit_0051"] and len(set(tried)) == 54
 
 
 def looked_at(share, count, looks=float("inf")):

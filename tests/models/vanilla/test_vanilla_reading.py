@@ -80,6 +80,13 @@ def test_columns_of_16_bits_are_halves(tmp_path, form):
         torch.testing.assert_close(model.parameters()[name], tensor.half().float(), rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("name", ["f_dc_1", "f_rest_3", "scale_2", "rot_0"])
+def test_codes_in_place_of_values_are_refused(tmp_path, name):
+    codes = {**splat_columns(5), name: np.arange(5, dtype=np.uint8)}
+    with pytest.raises(CheckpointError, match=f"a.ply is quantized by .*: its column {name} holds whole numbers of 8 bits, .* export it again as fl"):
+        load_vanilla(write(tmp_path / "a.ply", codes))
+
+
 @pytest.mark.parametrize("full", [np.uint8(255), np.float32(1), np.float32(255)])
 def test_rgb_stands_in_for_dc(tmp_path, full):
     columns = {name: column for name, column in splat_columns(2, 0).items() if not name.startswith("f_dc")}
