@@ -122,7 +122,7 @@ def _why_not(files: Files) -> str:
         remedy = "install the package that adds that family (`mipmap-plugin list families` shows which are found), or give the file its ending again"
         return f"{path} was adapted from a checkpoint of a family that is not installed here, or knows its files by another ending; {remedy}"
     if files.header:
-        if len(missing := OF_SPLATS - files.columns) < len(OF_SPLATS) / 2:
+        if len(missing := OF_SPLATS - files.columns) < len(OF_SPLATS) / 2 or "f_dc_0" in files.columns:
             return f"{path} is no whole 3DGS checkpoint: it lacks the columns {', '.join(sorted(missing))}; export it again with them"
         columns = ", ".join(files.header.vertex.names[:8])
         return f"{path} is a plain point cloud or a mesh (columns {columns}), not Gaussian splats; give a trained model"

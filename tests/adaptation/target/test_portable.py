@@ -26,7 +26,7 @@ from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale, Traits
-from mipmap_plugin.splatting.viewers import BUILT_IN, FURTHER, find_viewer, viewers_for
+from mipmap_plugin.splatting.viewers import BUILT_IN, FURTHER, SUPERSPLAT_VIEWER, find_viewer, viewers_for
 
 BRIEF = dict(steps=2, extra_views=1, merge_to=1.0, warm_up=0, views_per_step=3, validation_views=2)
 PAIR = ("classic", "spark")
@@ -52,7 +52,7 @@ def colored(*shades):
 
 
 def test_portable_is_every_built_in_viewer_but_the_further_ones_with_the_usual_one_first():
-    assert viewers_for("portable") == tuple(viewer.name for viewer in BUILT_IN if viewer not in FURTHER)
+    assert viewers_for("portable") == tuple(viewer.name for viewer in BUILT_IN if viewer not in (SUPERSPLAT_VIEWER, *FURTHER))
     assert viewers_for("portable")[0] == "classic" and viewers_for("spark") == ("spark",)
 
 
