@@ -51,7 +51,7 @@ class BaseWeights:
 
         def enough(shown: float) -> int:
             self.count = views_for(shown)
-            while self.count > LEAST_VIEWS and not self._clock.allows("weights", self.count / LEAST_VIEWS - 1):
+            while self.count > LEAST_VIEWS and not self._clock.allows("weights", min(self.count, len(problem.views)) / LEAST_VIEWS - 1):
                 self.count //= 2
             return self.count
 

@@ -1,13 +1,16 @@
 """Blend weights: how many pixels each splat fills, from any backend."""
 
 import math
+from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 from tiny import cameras, model
 
-from mipmap_plugin.adaptation.start.base_weights import weighed_in_parts
+from mipmap_plugin.adaptation.start import base_weights
+from mipmap_plugin.adaptation.start.base_weights import BaseWeights, weighed_in_parts
 from mipmap_plugin.adaptation.start.blend_weights import _color_gradient, blend_weights, may_show, weighed, whole_weights
 from mipmap_plugin.adaptation.start.matching import PARTS
 from mipmap_plugin.backends import get_backend
@@ -124,3 +127,14 @@ def test_each_part_of_the_views_has_its_own_blend_weights(count, enough):
     expected[numbers, [place % PARTS for place in range(len(numbers))]] = 1 / len(numbers)
     assert sorted(numbers) == evenly(range(count), enough)
     torch.testing.assert_close(weights, expected)
+
+
+@pytest.mark.parametrize(("time", "count"), [(0.7, 20), (0.6, 12)])  # of the twelve that are looked at first, for the other eight
+def test_a_time_budget_counts_the_views_that_there_are(monkeypatch, time, count):
+    views = cameras(20)
+    problem = SimpleNamespace(views=views, closest_of=views, scale=1 / 2, base_effects=Effects(0), backend=ReferenceBackend())
+    clock = SimpleNamespace(timing=lambda *_: nullcontext(), size=lambda *_: 1.0, allows=lambda work, amount: amount <= time)
+    monkeypatch.setattr(base_weights, "views_for", lambda shown: 48)
+    seen = BaseWeights(problem, clock)
+    assert seen.measured(model(60)).shape == (60, PARTS)
+    assert len(seen.views) == count

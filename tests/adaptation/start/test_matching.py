@@ -1,6 +1,7 @@
 """Matching blend weights: exact for two splats of which one half hides the other, and harmless for the rest."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import tiny
@@ -10,7 +11,7 @@ from mipmap_plugin.adaptation.start import matcher
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.candidates import StartSearch
 from mipmap_plugin.adaptation.start.clock import Clock
-from mipmap_plugin.adaptation.start.matcher import UNMATCHED
+from mipmap_plugin.adaptation.start.matcher import UNMATCHED, Matcher
 from mipmap_plugin.adaptation.start.matching import MAX_FACTOR, PART_PIXELS, SWEEPS, matched_opacities, sweeps_over
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
@@ -116,6 +117,16 @@ def test_parts_have_some_views_and_some_thousand_pixels(views, width, parts):
     camera = Camera(width, width, 10.0, 10.0, width / 2, width / 2, torch.eye(4))
     assert sweeps_over(views * [camera]) == SWEEPS[parts]
     assert parts == 1 or views * width**2 // parts >= PART_PIXELS
+
+
+@pytest.mark.parametrize(("time", "count", "sweeps"), [(3.0, 40, (1, 1, 1)), (2.9, 40, (1, 1)), (1.4, 20, (1, 1)), (0.4, 1, ())])
+def test_there_are_as_many_sweeps_as_splats_pixels_and_views_leave_time_for(time, count, sweeps):
+    """Of the base 80 splats were weighed. At half of their size views take a quarter of the time at least, and 24 twice that of the first twelve."""
+    problem = SimpleNamespace(base_effects=Effects(0), target=Effects(0, eps2d=0.2), has_blend_weights=True, scale=1 / 2)
+    seen = SimpleNamespace(views=24 * [VIEW], size=1.0, whole_of_base=torch.ones(80), notes=[])
+    clock = SimpleNamespace(allows=lambda work, amount: work == "weights" and amount <= time)
+    assert Matcher(problem, clock, seen).sweeps_for(torch.ones(count, 4)) == sweeps
+    assert seen.notes == ([] if sweeps else [UNMATCHED])
 
 
 def matched(opacities, wanted, whole, weigh, sweeps=WHOLE):
