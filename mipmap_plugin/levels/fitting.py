@@ -46,6 +46,9 @@ ANY_SCALE = 1 / 3
 
 ENDINGS = (*WRITTEN, ".ply")
 
+# Those of files that are compressed without loss in the end, so that their bytes depend on the values of the splats.
+SQUEEZED = (".spz", ".sog")
+
 
 def recorded(base: FrozenBase, requests: Sequence[tuple[float, str | None]], settings: Mapping[str, Any]) -> dict[str, Any]:
     """What the header of an adapted file will record, as far as it is known before the run; of several files, that of the largest.
@@ -74,9 +77,9 @@ def splats_within(model: SplatModel, size: int, name: str, record: dict[str, Any
     """
     ending = next((each for each in ENDINGS if name.lower().endswith(each)), "")
     count = len(model.parameters()["means"])
-    compressed = ending in WRITTEN and holds_splats(model)
-    fitting = _fitting(_unrounded(model, count) if compressed else model, size, name, ending, record)
-    if compressed and ending != ".glb" and 0 < fitting < count:  # of fewer splats each takes more bytes, above all in SOG, where they share entries
+    squeezed = ending in SQUEEZED and holds_splats(model)
+    fitting = _fitting(_unrounded(model, count) if squeezed else model, size, name, ending, record)
+    if squeezed and 0 < fitting < count:  # of fewer splats each takes more bytes, above all in SOG, where they share entries
         fitting = _fitting(_unrounded(model, fitting), size, name, ending, record)
     if fitting < 1:
         raise SettingsError(f"bytes: {plural(size, 'byte')} have no room for a header and a splat of this checkpoint; allow more")
@@ -109,7 +112,7 @@ def _fitting(model: SplatModel, size: int, name: str, ending: str, record: dict[
         besides, all_of_them = _besides(own), own.stat().st_size
     if besides:
         return (size - besides - UNKNOWN) * count // (all_of_them - besides)
-    return int((COMPRESSED_MARGIN * size if ending in WRITTEN else size - ARCHIVE) * count / all_of_them)
+    return int((COMPRESSED_MARGIN * size if ending in SQUEEZED else size - ARCHIVE) * count / all_of_them)
 
 
 def _besides(file: Path) -> int:
