@@ -41,7 +41,7 @@ class Report(BaseModel):
         seconds: By phase; "total": all of them but "loading".
         ended_by: What ended the run, such as a number of steps or a time budget.
         returned: Which of the run's states the file holds, and why if it is not the last.
-        validation: dB of each state on views that nothing was adapted to and that did not steer the run, at most 54 of a view.
+        validation: dB of each state on views that nothing was adapted to, at most 54 of a view. They did not steer the run, unless there is only one.
         written: dB of the file itself on the same views, where its format rounds splats; None where it does not.
         viewers: Of a file for several viewers: dB in each on the same views; `validation` is the worst of the extreme viewers.
         as_trained: dB of the base itself on the same views, drawn as its training drew it; None at x1, and where the file is drawn so too.

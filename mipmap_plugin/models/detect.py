@@ -20,7 +20,6 @@ from mipmap_plugin.models.zipped_folder import retold, unzipped, with_archives_n
 EXCHANGED = (".spz", ".sog", ".splat", ".ksplat", ".glb", ".gltf")
 OWN_SUFFIXES = (".ply", ".pt", ".ckpt", *EXCHANGED)
 
-
 # The families of this package.
 OWN = frozenset(family.name for family in BUILT_IN)
 

@@ -93,7 +93,7 @@ class StartSearch:
         return pixel, whole_weights(gaussians, pixel, self.scene.views.adapted, self.scene.base_effects, self.scene.scale)
 
     def _merger(self, weights: Tensor) -> Merger[str]:
-        """Merges the base's splats, which have these blend weights [N], into candidates, which it names."""
+        """Merges the base's splats, which have these blend weights [N, P], into candidates, which it names."""
         scene, config = self.scene, self.scene.config
 
         def merge(power: float, coarsely: bool) -> Candidate[str]:
@@ -120,7 +120,7 @@ class StartSearch:
             pool.release_to_system()
 
     def _merged(self, name: str, number: int, own: Tensor, fraction: float, coarsely: bool) -> tuple[Tensor, Tensor]:
-        """Write a core's candidate, from its blend weights `own`; returns the candidate's, and those that it had if nothing hid it."""
+        """Write a core's candidate, from its blend weights `own` [N, P]; returns the candidate's, and those that it had if nothing hid it."""
         scene = self.scene
         model = scene.for_target(scene.base.parameters(scene.cores[number]))
         whole = torch.empty(0)

@@ -2,6 +2,7 @@
 
 Half of them steer the run: it is compared with the base on them at every check, harmful steps are undone, and the best state is kept.
 The other half is used once, at the end, to choose among the base as it is, the start, the best state and the last.
+Where there is a single view, it does both.
 """
 
 from __future__ import annotations

@@ -21,8 +21,8 @@ from mipmap_plugin.camera import Camera
 # The most parts that views are divided in, of which part k has every PARTS-th view from the k-th on.
 PARTS = 4
 
-# A part has at least so many views and target pixels. With half as many views lego has 0.4 to 0.7 dB less at x1/4; with 864 pixels, for 39,000
-# splats, 0.8 dB at x1/16.
+# A part has at least so many views, and so many pixels of the size at which they are weighed. With half as many views lego has 0.4 to 0.7 dB less at
+# x1/4; with 864 pixels, for 39,000 splats, 0.8 dB at x1/16.
 PART_VIEWS, PART_PIXELS = 6, 10_000
 
 # An opacity changes by at most this factor per part.
@@ -48,7 +48,7 @@ SWEEPS = {4: Sweeps((4, 2), (1, 1)), 2: Sweeps((2, 2), (1, 1)), 1: Sweeps((1, 1,
 
 
 def sweeps_over(views: Sequence[Camera]) -> Sweeps:
-    """The sweeps over views of the target's scale."""
+    """The sweeps over `views`, of the size at which splats are weighed in them."""
     pixels = sum(view.width * view.height for view in views)
     return next(sweeps for parts, sweeps in SWEEPS.items() if parts <= max(1, min(len(views) // PART_VIEWS, pixels // PART_PIXELS)))
 
