@@ -44,7 +44,7 @@ class Sweeps(NamedTuple):
 
 
 # By the number of parts that the views can be divided in.
-SWEEPS = {4: Sweeps((4, 2), (1, 1)), 2: Sweeps((2, 2), (1, 1)), 1: Sweeps((1, 1, 1), (1, 1, 1))}
+SWEEPS = {4: Sweeps((4,), (2, 1, 1)), 2: Sweeps((2, 2), (1, 1)), 1: Sweeps((1, 1, 1), (1, 1, 1))}
 
 
 def sweeps_over(views: Sequence[Camera]) -> Sweeps:
