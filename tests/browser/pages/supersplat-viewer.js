@@ -46,9 +46,9 @@ export async function start({ renderer = 'webgpu', ...settings }) {
         app.renderNextFrame = asked // and not in each frame: a software GPU would fall behind
         asked = false
       })
+      if (streamed.lodBaseDistance) viewer.events.once('loaded:changed', () => apply(app, streamed))
       while (!viewer.state.loaded) await nextFrame()
       app.scene.gsplat.colorUpdateAngle = 0 // a viewer in motion reuses colors
-      if (streamed.lodBaseDistance) apply(app, streamed)
     },
 
     async draw(wanted) {
@@ -76,4 +76,5 @@ export async function start({ renderer = 'webgpu', ...settings }) {
 function apply(app, { lodBaseDistance, lodMultiplier, splatBudgetMode, splatBudget, lodUpdateDistance }) {
   Object.assign(app.scene.gsplat, { splatBudgetMode, splatBudget, lodUpdateDistance })
   Object.assign(app.root.findComponent('gsplat'), { lodBaseDistance, lodMultiplier })
+  app.renderNextFrame = true
 }
