@@ -40,9 +40,9 @@ command:
 - lego_400_P1_area: the same at x1/4 and x1/8 with `--resize area`: adapted to box averages.
 - bird_544: the same command by P3 and with `--recipe instant`, of a phone's capture that was trained on 161 photographs, judged on the 23 others.
 
-The SSIM of an earlier version left a border of 5 px out: that of bird_544, of lego_400 and those after it, and of `thorough` of chair_400 and
-lego_200, whose other rows count it and are not comparable in this. `instant` of bird_544 and lego_400 is of that version too. The seconds of `paper`
-and `default` of the other bases are of one run, on a machine that was up to 1.5 times as slow as when those of `thorough` were measured.
+The SSIM of an earlier version left a border of 5 px out: that of bird_544, of lego_400 and those after it is not comparable with the others'. `instant` of
+bird_544 and lego_400 is of that version too. The other bases are of one run on two free cores, two bases at once, so that seconds are comparable
+among recipes.
 """
 RECIPES: tuple[str, ...] = ("instant", "paper", "default")
 
