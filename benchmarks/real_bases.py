@@ -40,9 +40,9 @@ command:
 - lego_400_P1_area: the same at x1/4 and x1/8 with `--resize area`: adapted to box averages.
 - bird_544: the same command by P3 and with `--recipe instant`, of a phone's capture that was trained on 161 photographs, judged on the 23 others.
 
-The SSIM of an earlier version left a border of 5 px out: that of bird_544, of lego_400 and those after it is not comparable with the others'. `instant` of
-bird_544 and lego_400 is of that version too. The other bases are of one run on two free cores, two bases at once, so that seconds are comparable
-among recipes.
+The SSIM of an earlier version left a border of 5 px out: that of bird_544, of lego_400 and those after it is not comparable with the
+others'. `instant` of bird_544 and lego_400 is of that version too. The other bases are of one run on two free cores, two bases at once, so that
+seconds are comparable among recipes.
 """
 RECIPES: tuple[str, ...] = ("instant", "paper", "default")
 

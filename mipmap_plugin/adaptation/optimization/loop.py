@@ -78,7 +78,8 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera]) ->
     if run.step == config.reset_opacity_at and task.white_background:
         density.reset_opacities(run.optimizer)
     task.follow(run.student)
-    set_rates(run.optimizer, config, run.progress(config), run.steering.rate_factor(run.step, config), frozen_parameters(run))
+    rate_factor = run.steering.rate_factor(run.step, config)
+    set_rates(run.optimizer, config, run.step, run.progress(config), rate_factor, frozen_parameters(run))
     growing = run.gradients is not None  # by the gradients of each view
     at_once = 1 if growing else views_at_once(task.cameras[view] for view in views)
     run.by_rows = ByRows.of(run.student, task.render_to_step, run.by_rows) if len(views) <= at_once else None

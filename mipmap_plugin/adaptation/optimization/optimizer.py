@@ -18,6 +18,10 @@ from mipmap_plugin.splatting.bands import lie_in_one_tensor, neighbors
 # INRIA's value: gradients of single splats are so small that Adam's usual 1e-8 would damp them.
 ADAM_EPS = 1e-15
 
+# The rate of the SH bands above 0 rises from this fraction over so many steps: Adam's first steps are as long by chance as by what many views agree
+# on, and most numbers of a splat are of these bands. Worth 1 to 3 dB to runs of 5 to 10 steps, nothing to long ones (docs/recipes_found.md).
+FIRST_FRACTION, RISING_STEPS = 0.25, 16
+
 
 def make_optimizer(model: SplatModel, config: AdaptConfig, pixel: float) -> Adam:
     """One group per parameter; the learning rate of the means is in pixels of `pixel` world units."""
@@ -29,14 +33,16 @@ def make_optimizer(model: SplatModel, config: AdaptConfig, pixel: float) -> Adam
     return Adam(groups, betas=config.betas, eps=ADAM_EPS, nesterov=config.nesterov)
 
 
-def set_rates(optimizer: Adam, config: AdaptConfig, progress: float, rate_factor: float, frozen: Collection[str] = ()) -> None:
-    """Set all learning rates for `progress` (0..1): `decayed`, times `rate_factor`.
+def set_rates(optimizer: Adam, config: AdaptConfig, step: int, progress: float, rate_factor: float, frozen: Collection[str] = ()) -> None:
+    """Set all learning rates for `progress` (0..1): `decayed`, times `rate_factor`; in a run with a warm-up those of SH bands rise with `step`.
 
     The rates of the groups named in `frozen` are 0.
     """
     factor = rate_factor * decayed(config, progress)
+    rising = FIRST_FRACTION + (1 - FIRST_FRACTION) * min(1.0, step / RISING_STEPS) if config.warm_up else 1.0
     for group in optimizer.param_groups:
-        group["lr"] = 0.0 if group["name"] in frozen else group["base_lr"] * factor
+        name = group["name"]
+        group["lr"] = 0.0 if name in frozen else group["base_lr"] * factor * (rising if name == "shN" else 1.0)
 
 
 def decayed(config: AdaptConfig, progress: float) -> float:

@@ -221,18 +221,27 @@ def test_rates_fall_to_their_share_and_the_means_are_in_pixels(student):
     adam = make_optimizer(student, config, pixel=3.0)
     rate = lambda name: next(group["lr"] for group in adam.param_groups if group["name"] == name)  # noqa: E731
     assert (rate("means"), rate("sh0"), rate("quats")) == (pytest.approx(0.3), 0.5, 0)
-    set_rates(adam, config, 0.5, 1.0)
+    set_rates(adam, config, 50, 0.5, 1.0)
     assert (rate("means"), rate("sh0")) == (pytest.approx(0.3 * 0.505), pytest.approx(0.5 * 0.505))
-    set_rates(adam, config, 1.0, 1.0)
+    set_rates(adam, config, 100, 1.0, 1.0)
     assert rate("sh0") == pytest.approx(0.005)
 
 
 def test_every_rate_is_as_bold_as_the_run_may_be(student):
     config = AdaptConfig(steps=16, rates=LearningRates(sh0=0.5, shN=0.2))
     adam = make_optimizer(student, config, pixel=1.0)
-    set_rates(adam, config, 0.0, 0.25)
+    set_rates(adam, config, 0, 0.0, 0.25)
     rates = {group["name"]: group["lr"] for group in adam.param_groups}
     assert (rates["sh0"], rates["shN"], rates["scales"]) == pytest.approx((0.125, 0.05, config.rates.scales / 4))
+
+
+@pytest.mark.parametrize(("warm_up", "step", "share"), [(0.1, 0, 0.25), (0.1, 8, 0.625), (0.1, 16, 1), (0.1, 90, 1), (0, 0, 1)])
+def test_the_rate_of_sh_bands_rises_in_the_first_steps_of_a_run_with_a_warm_up(student, warm_up, step, share):
+    config = AdaptConfig(steps=100, decay=1.0, warm_up=warm_up, rates=LearningRates(sh0=0.5, shN=0.2))
+    adam = make_optimizer(student, config, pixel=1.0)
+    set_rates(adam, config, step, 0.0, 1.0)
+    rates = {group["name"]: group["lr"] for group in adam.param_groups}
+    assert (rates["sh0"], rates["shN"]) == pytest.approx((0.5, 0.2 * share))
 
 
 def test_a_step_is_that_of_torchs_adam_bit_by_bit():
