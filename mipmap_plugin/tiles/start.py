@@ -15,7 +15,7 @@ from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.base_weights import note_on_hidden, weighed_in_parts
 from mipmap_plugin.adaptation.start.blend_weights import may_show, whole_weights
 from mipmap_plugin.adaptation.start.candidates import start_name
-from mipmap_plugin.adaptation.start.closed_form import FormSettings, closed_form, draws_alike, filter_suffices
+from mipmap_plugin.adaptation.start.closed_form import LEAST_AXIS, FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import matched_opacities, sweeps_over
 from mipmap_plugin.adaptation.start.merging import merge_down, merge_seen
 from mipmap_plugin.adaptation.start.strength import Bounds, Candidate, Merger, MergingCosts
@@ -139,7 +139,8 @@ class StartSearch:
         def formed(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
             nonlocal whole
             pixel, whole = self._sizes(gaussians)
-            form = FormSettings(area_power=1.0, views=len(self.views), pixel=pixel, matched=True)
+            least = LEAST_AXIS if scene.config.steps else 0.0
+            form = FormSettings(area_power=1.0, views=len(self.views), pixel=pixel, matched=True, least_axis=least)
             return closed_form(gaussians, scene.views.adapted, scene.scale, scene.base_effects, scene.target, form)
 
         if fraction < 1:

@@ -15,7 +15,7 @@ from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.pixel_size import mean_pixel_size
 from mipmap_plugin.adaptation.start.base_weights import BaseWeights
 from mipmap_plugin.adaptation.start.clock import Clock, start_clock
-from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike
+from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, LEAST_AXIS, FormSettings, closed_form, draws_alike
 from mipmap_plugin.adaptation.start.matcher import Matcher
 from mipmap_plugin.adaptation.start.merging import MergingRounds, merge_down, merge_seen
 from mipmap_plugin.adaptation.start.problem import StartProblem
@@ -290,7 +290,8 @@ class StartSearch:
         pixel = self._seen.pixel_size(gaussians.means)
         formed_for = mean_pixel_size(gaussians.means, problem.closest_of, self._seen.count) if problem.scale > 1 else pixel
         power = 1.0 if sweeps else self._power
-        settings = FormSettings(power, self._crispness, self._seen.count, formed_for, matched=power == 1)
+        least = LEAST_AXIS if self._learns and not self._clock.limited else 0.0
+        settings = FormSettings(power, self._crispness, self._seen.count, formed_for, matched=power == 1, least_axis=least)
         scales, opacities = closed_form(gaussians, problem.views, problem.scale, problem.base_effects, problem.target, settings)
         if weights is None or not sweeps:
             return scales, opacities

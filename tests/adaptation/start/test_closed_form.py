@@ -104,6 +104,20 @@ def test_zoom_out_of_splats_below_a_pixel_trades_opacity_for_area(scale):
     assert new.scales.isfinite().all()
 
 
+@pytest.mark.parametrize(("width", "left"), [(0.2, 0.2), (0.5, 0.3), (1.2, math.sqrt(1.2**2 - DILATION * 15 / 16))])
+def test_before_steps_no_splat_is_narrowed_to_a_line(width, left):
+    """Seen from nearer than the views it would be one. What is narrower already stays as it is. Target pixels at x1/4."""
+    splat = disc(4 * width, 4 * width)
+    scales, _ = closed_form(splat, [VIEW], 1 / 4, Effects(0), Effects(0), FormSettings(least_axis=0.3))
+    torch.testing.assert_close(scales[0, :2], splat.scales.new_tensor([left, left]) * 4 * PIXEL)
+
+
+def test_the_least_axis_is_of_zoom_out_only():
+    splat = disc(0.8, 0.3)
+    plain, wide = (closed_form(splat, [VIEW], 4, Effects(0), Effects(0), FormSettings(least_axis=each))[0] for each in (0.0, 9.0))
+    assert torch.equal(plain, wide)
+
+
 @pytest.mark.parametrize("scale", [1 / 64, 1 / 4, 4, 64])
 def test_hostile_splats_stay_finite(scale):
     """Behind the camera, at its eye, beyond every edge, without any extent, huge, a needle."""
