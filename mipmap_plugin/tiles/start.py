@@ -139,7 +139,7 @@ class StartSearch:
         def formed(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
             nonlocal whole
             pixel, whole = self._sizes(gaussians)
-            least = LEAST_AXIS if scene.config.steps else 0.0
+            least = LEAST_AXIS if scene.config.steps and scene.config.time_budget_s is None else 0.0
             form = FormSettings(area_power=1.0, views=len(self.views), pixel=pixel, matched=True, least_axis=least)
             return closed_form(gaussians, scene.views.adapted, scene.scale, scene.base_effects, scene.target, form)
 
