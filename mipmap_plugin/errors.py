@@ -150,3 +150,8 @@ def unknown(kind: str, name: str, names: Sequence[str]) -> str:
 def brief(error: BaseException) -> str:
     """The first line of another library's error."""
     return (str(error).splitlines() or [type(error).__name__])[0][:120]
+
+
+def with_type(error: BaseException) -> str:
+    """Another library's error behind its type, in one line, as tables need it: "KeyError: 'level'"."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"

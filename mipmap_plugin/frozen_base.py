@@ -124,7 +124,8 @@ class FrozenBase:
     ) -> Rendered:
         """Render the base model's view of `camera`, which samples `scale` times as finely as the training did.
 
-        `screen_filter`: as in `effects`. `supersampling`: samples per pixel along each axis. `options`: `RenderOptions`. Raises SettingsError.
+        `screen_filter`: as in `effects`. `supersampling`: samples per pixel along each axis. `options`: `RenderOptions`. Raises SettingsError,
+        BackendUnavailable, PluginError.
         """
         [camera], outputs = checked([camera]), as_outputs(options.get("outputs"))
         check_names("render", options, RenderOptions, ("scale", "screen_filter", "supersampling"))

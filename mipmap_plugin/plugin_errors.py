@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from mipmap_plugin.errors import MipmapPluginError, PluginError, ShapeError
+from mipmap_plugin.errors import MipmapPluginError, PluginError, ShapeError, with_type
 from mipmap_plugin.limits import is_out_of_memory
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def naming(what: str) -> Iterator[None]:
     except (Exception, SystemExit) as error:
         if isinstance(error, MipmapPluginError) or is_out_of_memory(error):
             raise
-        raise PluginError(f"{what} failed: {type(error).__name__}: {error}") from error
+        raise PluginError(f"{what} failed: {with_type(error)}") from error
 
 
 @contextmanager
@@ -48,7 +48,7 @@ def naming_any(plugins: Mapping[str, Any]) -> Iterator[None]:
             raise
         for what, thing in plugins.items():
             if is_third_party(thing) and any(_is_of(frame, thing) for frame, _ in traceback.walk_tb(error.__traceback__)):
-                raise PluginError(f"{what} failed: {type(error).__name__}: {error}") from error
+                raise PluginError(f"{what} failed: {with_type(error)}") from error
         raise
 
 

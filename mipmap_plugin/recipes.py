@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from mipmap_plugin.config import AdaptConfig, LearningRates
-from mipmap_plugin.errors import PluginError, SettingsError, type_of
+from mipmap_plugin.errors import PluginError, SettingsError, type_of, with_type
 from mipmap_plugin.limits import check_scale
 from mipmap_plugin.registry import Registry
 
@@ -112,9 +112,10 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
     try:
         made = function(scale, str(overrides.get("upsampler", "bicubic")) not in INTERPOLATIONS)
     except (Exception, SystemExit) as error:  # third-party code may fail in any way
-        raise PluginError(f"recipe {name!r} failed at x{scale:g}: {type(error).__name__}: {error}") from error
-    if not isinstance(made, Mapping):
-        raise PluginError(f"recipe {name!r} has to return a dict of settings; at x{scale:g} it returned {type_of(made)}")
+        raise PluginError(f"recipe {name!r} failed at x{scale:g}: {with_type(error)}") from error
+    if not isinstance(made, Mapping) or not all(isinstance(key, str) for key in made):
+        got = "other keys than texts" if isinstance(made, Mapping) else type_of(made)
+        raise PluginError(f"recipe {name!r} has to return a dict of settings by name; at x{scale:g} it returned {got}")
     settings = {"recipe": name, **made}
     try:
         AdaptConfig(**settings)

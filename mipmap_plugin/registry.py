@@ -12,7 +12,7 @@ from functools import lru_cache
 from importlib.metadata import Distribution, EntryPoint, distributions, entry_points
 from typing import Any
 
-from mipmap_plugin.errors import PluginError, SettingsError, brief, unknown
+from mipmap_plugin.errors import PluginError, SettingsError, brief, unknown, with_type
 
 
 class Registry:
@@ -137,4 +137,4 @@ def load_target(name: str, target: str) -> Any:
     try:
         return operator.attrgetter(attribute)(_imported(module))
     except (Exception, SystemExit) as error:  # a third-party module may fail in any way; one broken plug-in must not break the others
-        raise PluginError(f"{name!r} ({target}) cannot be loaded: {type(error).__name__}: {error}") from error
+        raise PluginError(f"{name!r} ({target}) cannot be loaded: {with_type(error)}") from error

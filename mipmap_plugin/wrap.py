@@ -53,9 +53,10 @@ class Wrapped(FrozenBase):
 
     @in_usual_modes
     def levels(self, viewer: str, *, resume: str | Path | None = None, **options: Any) -> Ladder:
-        """Return a ladder of levels (`levels.finished.Ladder`), to be saved with `save(folder)`. `options`: those of `LadderRequest.of`.
+        """Return a ladder of levels (`levels.finished.Ladder`), to be saved with `save(folder)`.
 
-        Raises as `adapt`.
+        `options`: `coarsest`, `ratio`, `least_db`, `until_splats`, `recipe`, `by` (`levels.request.LadderRequest`), and settings of AdaptConfig for
+        all levels. `resume`: a folder that keeps finished levels, to continue from. Raises as `adapt`.
         """
         from mipmap_plugin.levels.ladder import make_levels
         from mipmap_plugin.levels.request import LadderRequest
@@ -81,7 +82,7 @@ def wrap_model(
     `threads`: to adapt with; by default as many as torch has. With the backend cpu the result does not depend on it.
     `options`: `background`, linear RGB, by default that of the checkpoint, or else black; `screen_filter`, that it was trained with, if its
     files do not say ("classic", "antialiased", "mip", "analytic"); `up`, the axis that is up ("z", "-y", ...), if they do not say: views that
-    are generated, as there are no cameras, then look from above the horizon. Raises CheckpointError, SceneError,
+    are generated, as there are no cameras, then look from above the horizon. Raises CheckpointError, SceneError, PluginError,
     ShapeError for tensors that do not fit together, and SettingsError for an unknown filter or axis, or an object that is not a model.
     """
     wrapped, scene = wrap_unchecked(model, cameras, backend, threads, **options)

@@ -10,7 +10,7 @@ import torch
 
 from mipmap_plugin.backends.base import API_VERSION, Backend, Needs
 from mipmap_plugin.backends.guarded import Guarded
-from mipmap_plugin.errors import BackendUnavailable, PluginError, SettingsError, type_of, warn
+from mipmap_plugin.errors import BackendUnavailable, PluginError, SettingsError, type_of, warn, with_type
 from mipmap_plugin.plugin_errors import is_third_party
 from mipmap_plugin.registry import Registry
 
@@ -41,7 +41,7 @@ def get_backend(name: str) -> Backend:
     try:
         backend: Backend = factory()
     except Exception as error:  # a third-party constructor may fail in any way; one broken plug-in must not break the others
-        raise PluginError(f"backend {name!r} cannot be created: {type(error).__name__}: {error}") from error
+        raise PluginError(f"backend {name!r} cannot be created: {with_type(error)}") from error
     if getattr(backend, "api_version", None) != API_VERSION:
         version = getattr(backend, "api_version", "unknown")
         raise PluginError(f"backend {name!r} is written for API version {version}, but this package has API version {API_VERSION}")
@@ -115,7 +115,7 @@ def _lacking(name: str, backend: Backend, needs: Sequence[Needs]) -> list[str]:
     try:
         answers: list[Any] = [backend.lacking(need) for need in needs]
     except (Exception, SystemExit) as error:  # as in `get_backend`
-        raise PluginError(f"backend {name!r} cannot say what it lacks: {type(error).__name__}: {error}") from error
+        raise PluginError(f"backend {name!r} cannot say what it lacks: {with_type(error)}") from error
     if wrong := [answer for answer in answers if not isinstance(answer, (list, tuple))]:
         raise PluginError(f"backend {name!r}: lacking() has to return a list of sentences; it returned {type_of(wrong[0])}")
     return list(dict.fromkeys(str(reason) for answer in answers for reason in answer))

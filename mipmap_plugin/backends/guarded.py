@@ -21,6 +21,9 @@ from mipmap_plugin.plugin_errors import naming, unchanged
 # What a backend may have beside `lacking` and `render`.
 OPTIONAL = ("render_views", "blend_weights", "weigh_views", "stepper", "compile_ahead")
 
+# What a stepper has to have.
+STEPS = ("render", "differentiate", "step")
+
 # Beyond so much, and beyond so many times the brightest splat, an image has colors of another range.
 BRIGHT = 4.0
 
@@ -120,7 +123,10 @@ class Guarded:
 
     def _stepper(self, theirs: Any, raw: Mapping[str, Tensor]) -> _GuardedStepper:
         with naming(self._title):
-            return _GuardedStepper(self._title, theirs(raw))
+            stepper = theirs(raw)
+        if missing := [part for part in STEPS if not callable(getattr(stepper, part, None))]:
+            raise PluginError(f"{self._title}: stepper has to return a Stepper; {type_of(stepper)}, which it returned, lacks {', '.join(missing)}")
+        return _GuardedStepper(self._title, stepper)
 
     _compile_ahead = _call
 

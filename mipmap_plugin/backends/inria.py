@@ -32,6 +32,7 @@ from mipmap_plugin.backends.external import NO_CUDA, at_the_origin, finite_splat
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import with_type
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.screen_filters import DILATION
 from mipmap_plugin.splatting.filters import footprint
@@ -104,7 +105,7 @@ def missing() -> list[str]:
     try:
         fields = importlib.import_module(PACKAGE).GaussianRasterizationSettings._fields
     except Exception as error:  # an extension built for another torch or another GPU may fail in any way
-        return [f"{PACKAGE} does not load: {type(error).__name__}: {error}"]
+        return [f"{PACKAGE} does not load: {with_type(error)}"]
     return [] if fields in (OLDER, NEWER) else [f"the {PACKAGE} here is a fork with other settings: {', '.join(fields)}"]
 
 

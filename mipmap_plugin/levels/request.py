@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.adaptation.start.problem import FinerLevel
@@ -73,6 +74,9 @@ class LadderRequest:
         check_scale(self.coarsest)
         if self.coarsest > 1:
             raise SettingsError(f"coarsest: a ladder begins at x1 and goes down, but x{self.coarsest:g} is finer; give 1/16, for example")
+        for name in ("ratio", "least_db", "until_splats"):
+            if not isinstance(number := getattr(self, name), Real | None):
+                raise SettingsError(f"{name}: must be a number, got {number!r}")
         if self.ratio is not None and not FINEST_RATIO <= self.ratio <= 4:
             raise SettingsError(f"ratio: must be from {FINEST_RATIO:.3g} to 4, such as 2, got {self.ratio:g}")
         if self.until_splats is not None and self.until_splats < 1:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mipmap_plugin.models  # through which annotations that are evaluated find SplatModel, without importing it before
-from mipmap_plugin.errors import CheckpointError, MipmapPluginError, PluginError, type_of
+from mipmap_plugin.errors import CheckpointError, MipmapPluginError, PluginError, type_of, with_type
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.detect import Checkpoint, detect
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
@@ -63,7 +63,7 @@ def load_model(path: str | Path, *, iteration: int | None = None) -> mipmap_plug
     except (Exception, SystemExit) as error:  # third-party code may fail in any way
         if family in BUILT_IN:
             raise
-        raise PluginError(f"family {family.name!r} cannot load {checkpoint.path}: {type(error).__name__}: {error}") from error
+        raise PluginError(f"family {family.name!r} cannot load {checkpoint.path}: {with_type(error)}") from error
     if not hasattr(model, "gaussians"):  # it was not meant to be a model
         mend = "an object with the methods of mipmap_plugin.models.SplatModel, such as VanillaModel, which from_gaussians makes of Gaussians"
         raise PluginError(f"family {family.name!r}: its load has to return {mend}; it returned {type_of(model)}")
@@ -71,7 +71,7 @@ def load_model(path: str | Path, *, iteration: int | None = None) -> mipmap_plug
         raise PluginError(f"family {family.name!r} loads {type(model).__name__}, which lacks {', '.join(missing)}; see mipmap_plugin.models.base")
     if is_third_party(model) and model.family != family.name:
         raise PluginError(f"family {family.name!r} loads {type(model).__name__}, whose `family` is {model.family!r}; set it to {family.name!r}")
-    if family not in BUILT_IN and any(tensor.element_size() > BYTES for tensor in model.parameters().values()):
+    if family not in BUILT_IN and any(tensor.element_size() > BYTES and tensor.is_floating_point() for tensor in model.parameters().values()):
         model.notes.append(f"family {family.name!r} loads float64, which only the slow backend reference draws; its load should return float32")
     return model
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import NEAR_PLANE, Effect, Effects
+from mipmap_plugin.errors import PluginError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
 from mipmap_plugin.models.hosts import Capture
@@ -72,7 +73,7 @@ class Traits:
         no_viewer: Why no viewer (`viewers`) can draw the splats, a sentence without a full stop; empty if one can.
         exposures: The trained color transformation of each photograph.
         effects: Those of `effects.MODEL_EFFECTS` that the model simulates.
-        rows: What a row of its parameters is, in the plural.
+        rows: What a row of its parameters is, in the plural; another word than "splats" where `gaussians` may return more splats than rows, or fewer.
         thins: Some rows can be left out, for others to learn to show what they did: the model has `thin`.
         shrink_option: The option of cfg_args that tells its own project how much smaller pictures are than in training; empty if none does.
     """
@@ -216,9 +217,18 @@ def count_of(model: SplatModel, view: Camera, scale: float = 1.0) -> int:
 
 @torch.no_grad()
 def means_at(model: SplatModel, view: Camera) -> Tensor:
-    """Where the rows of the parameters are at a view's moment, [N, 3] in world units: a field may carry splats far from where they rest."""
-    moved = model.traits.moves and model.traits.rows == SPLATS
-    return (model.gaussians(view).means if moved else model.parameters()["means"]).detach()
+    """Where the rows of the parameters are at a view's moment, [N, 3] in world units: a field may carry splats far from where they rest.
+
+    Raises PluginError for splats that move and are not those of the rows.
+    """
+    at_rest = model.parameters()["means"].detach()
+    if not model.traits.moves or model.traits.rows != SPLATS:
+        return at_rest
+    means = model.gaussians(view).means.detach()
+    if len(means) != len(at_rest):
+        wrong = f"gaussians() returned {len(means):,} splats for {len(at_rest):,} rows of its parameters"
+        raise PluginError(f"family {model.family!r}: {wrong}; return one for each, or say by the trait `rows` what else these are")
+    return means
 
 
 def tensors_of(model: SplatModel) -> dict[str, Tensor]:

@@ -30,6 +30,9 @@ TYPES: dict[str, tuple[type, ...]] = {
     "digest": (str,),
 }  # fmt: skip
 
+# Types of what is optimized: steps are lost in float16, and no backend draws it.
+DRAWN = (torch.float32, torch.float64)
+
 # By which the activation of a third-party family may leave 0..1.
 OPACITY_ROUNDING = 1e-4
 
@@ -42,6 +45,11 @@ ENDINGS = {".ply": "ply", ".spz": "spz", ".sog": "sog"}
 
 def lacking(model: Any) -> list[str]:
     """What an object lacks to be a SplatModel: members, types, arguments, or the right parameters; [] if nothing. Raises PluginError if it fails."""
+    with naming_any({f"this {type(model).__name__}": model}):  # any attribute may be a property
+        return _lacking(model)
+
+
+def _lacking(model: Any) -> list[str]:
     traits = getattr(model, "traits", None)
     protocols = [SplatModel, *(protocol for trait, protocol in PROMISED.items() if getattr(traits, trait, False))]
     methods = {name: method for protocol in protocols for name, method in vars(protocol).items() if isfunction(method) and name[0] != "_"}
@@ -83,6 +91,8 @@ def _wrong_parameters(model: SplatModel) -> list[str]:
     wrong += [f"the parameters {', '.join(OF_3DGS)}, which its trait `plain` promises"] * (model.traits.plain and {*parameters} != {*OF_3DGS})
     if others := [name for name, tensor in {**parameters, **shared}.items() if not isinstance(tensor, Tensor)]:
         wrong.append(f"tensors as the parameters {', '.join(map(str, others))}")
+    if undrawn := [f"{name} of {tensor.dtype}" for name, tensor in parameters.items() if not wrong and name != CARRIED and tensor.dtype not in DRAWN]:
+        wrong.append(f"parameters of float32: it has {', '.join(undrawn)}")
     rows = {name: len(tensor) if tensor.ndim else "single" for name, tensor in parameters.items()} if not wrong else {}
     if len({*rows.values()}) > 1:
         wrong.append(f"parameters of one length: it has {', '.join(f'{count} {name}' for name, count in rows.items())}")
@@ -186,6 +196,14 @@ def rebuild(model: SplatModel, form: Callable[[Gaussians], Gaussians]) -> None:
         got = f"called it {len(made)} times" if len(made) != 1 else f"holds {rows} splats after it returned {made[0]}"
         raise PluginError(f"family {model.family!r}: rebuild(form) has to hold the splats that `form` returns; it {got}")
     _refuse_not_finite(model, "rebuild(form)")
+
+
+def replace_parameters(model: SplatModel, parameters: dict[str, Tensor]) -> None:
+    """Give the model these tensors as its leaves. Raises PluginError if it holds others then, which no optimizer would move."""
+    model.replace_parameters(parameters)
+    held = model.parameters() if is_third_party(model) else parameters
+    if others := [name for name, tensor in parameters.items() if held.get(name) is not tensor]:
+        raise PluginError(f"family {model.family!r}: replace_parameters() has to keep the tensors themselves; {', '.join(others)} are others then")
 
 
 def reshape(model: SplatModel, form: Callable[[Gaussians], tuple[Tensor, Tensor]], views: Sequence[Camera]) -> None:

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mipmap_plugin.errors import CheckpointError, PluginError, plural, type_of
+from mipmap_plugin.errors import CheckpointError, MipmapPluginError, PluginError, plural, type_of, with_type
 from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
@@ -95,7 +95,7 @@ def _claims(files: Files) -> tuple[dict[str, tuple[Family, Match]], list[str]]:
         except (Exception, SystemExit) as error:  # third-party code may fail in any way
             if name in OWN and isinstance(error, CheckpointError):
                 raise  # what is wrong with the file
-            notes.append(f"the family {name!r} failed: {error}")
+            notes.append(f"the family {name!r} failed: {error if isinstance(error, MipmapPluginError) else with_type(error)}")
     return claims, notes
 
 

@@ -10,12 +10,14 @@ import torch
 
 from mipmap_plugin.backends import reference, register_backend
 from mipmap_plugin.backends.base import Capabilities, Rendered
+from mipmap_plugin.backends.conformance import check_backend
 from mipmap_plugin.backends.conformance.cases import CASES, random_scene
 from mipmap_plugin.backends.conformance.tolerance import TOLERANCE, differing_images
 from mipmap_plugin.backends.conformance.usual_faults import EPS2D, FAULTS, usual_fault
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
 from mipmap_plugin.evaluation import backends as tables
+from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.splatting import harmonics
 
 
@@ -58,6 +60,11 @@ def shifted(by, g, camera, effects):
         (Wrong(partial(shifted, -0.5)), "shifted by half a pixel to the left and up"),
         (Wrong(lambda g, camera, effects: (g, camera, replace(effects, eps2d=0.3))), "dilates by 0.3 px² always"),
         (Wrong(turned), "reads quaternions as xyzw"),
+        (Wrong(returned=lambda rendered, effects: Rendered(rendered.image.flip(0), rendered.alpha.flip(0))), "is upside down"),
+        (Wrong(returned=lambda rendered, effects: Rendered(rendered.image.flip(2), rendered.alpha)), "in the order blue, green, red"),
+        (Wrong(returned=lambda rendered, effects: Rendered(rendered.image, 1 - rendered.alpha)), "its alpha is the transmittance"),
+        (Wrong(lambda g, camera, effects: (g, replace(camera, fy=camera.fx), effects)), "takes fx for fy"),
+        (Wrong(lambda g, camera, effects: (g, camera, replace(effects, settings=RenderSettings(radius=3.0)))), "end at three standard deviations"),
         (with_scales(2), "^the gradient of scales is 2 times the right one$"),
         (with_scales(-1), "^the gradient of scales is -1 times the right one$"),
         (with_scales(1.004), "^$"),  # as much as a pixel on a cut-off may do to a right one
@@ -67,6 +74,16 @@ def shifted(by, g, camera, effects):
 )  # fmt: skip
 def test_what_is_wrong_is_named(backend, said, dtype):
     assert re.search(said, usual_fault(backend, dtype=dtype))
+
+
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_a_principal_point_taken_for_the_center_is_found(axis):
+    def centered(g, camera, effects):
+        middle = {"x": dict(cx=camera.width / 2), "y": dict(cy=camera.height / 2)}[axis]
+        return g, replace(camera, **middle), effects
+
+    few = {name: CASES[name] for name in ("image-not-of-whole-tiles-classic", "principal-point-off-center-classic")}
+    assert [outcome.passed for outcome in check_backend(Wrong(centered), few)] == [True, False]
 
 
 def test_colors_below_0_are_named(monkeypatch):

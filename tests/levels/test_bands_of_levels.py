@@ -147,7 +147,8 @@ def test_levels_of_a_large_scene_take_fewer_steps_unless_asked_for(monkeypatch):
     ("options", "reason"),
     [({"coarsest": 2.0}, "goes down"), ({"ratio": 1.0}, "ratio: must be"), ({"until_splats": 0}, "until_splats"), ({"band": (0.5, 1)}, "band: set"),
      ({"least_db": math.nan}, "least_db: must be a number of dB"), ({"recipe": "nonsense"}, "there is no recipe"), ({"steps": -1}, "setting steps"),
-     ({"most_sh_degree": 3}, "most_sh_degree: set by the ladder")],
+     ({"most_sh_degree": 3}, "most_sh_degree: set by the ladder"), ({"ratio": "2"}, "ratio: must be a number, got '2'"),
+     ({"least_db": "32"}, "least_db: must be a number"), ({"until_splats": [9]}, "until_splats: must be a number")],
 )  # fmt: skip
 def test_impossible_ladders_are_refused(options, reason):
     with pytest.raises(SettingsError, match=reason):

@@ -122,6 +122,7 @@ def test_a_wrong_alpha_of_a_backend_is_told_by_its_name(alpha, said):
         ("blend_weights", lambda self, *_: torch.zeros(3), "blend_weights has to return 60 finite numbers"),
         ("weigh_views", lambda self, *_: torch.zeros(3), r"weigh_views has to return finite numbers \[\d+, 60\]"),
         ("stepper", lambda self, raw: 1 / 0, "failed: ZeroDivisionError"),
+        ("stepper", lambda self, raw: None, "stepper has to return a Stepper; a NoneType, which it returned, lacks render, differentiate, step"),
         ("compile_ahead", lambda self, *_: 1 / 0, "failed: ZeroDivisionError"),
     ],
 )
@@ -137,8 +138,21 @@ def test_a_backend_that_does_not_list_what_it_lacks_is_told():
         base.render(base.cameras[0])
 
 
+class Idle:
+    """A stepper that does nothing."""
+
+    def render(self, number, camera, effects):
+        pass
+
+    def differentiate(self, number, d_image, d_alpha=None):
+        pass
+
+    def step(self, step):
+        pass
+
+
 def test_a_stepper_that_draws_all_views_in_one_call_still_does_and_fails_by_its_backends_name():
-    class Failing:
+    class Failing(Idle):
         def render_all(self, shots):
             return 1 / 0
 
@@ -152,8 +166,7 @@ def test_a_stepper_that_draws_all_views_in_one_call_still_does_and_fails_by_its_
 
 def test_a_stepper_that_writes_no_gradient_for_growing_is_told():
     raw = {"means": torch.zeros(2, 3)}
-    stepper = type("Silent", (), {"step": lambda self, step: None})
-    base = backend(lambda rendered, _: rendered, stepper=lambda self, raw: stepper())
+    base = backend(lambda rendered, _: rendered, stepper=lambda self, raw: Idle())
     with pytest.raises(PluginError, match="backend 'odd': a step left NaN or infinity in the gradient of the means"):
         base.backend()[0].stepper(raw).step(AdamStep(raw, {}, {}, {}, (0.9, 0.99), 1.0, 1.0, means_gradient=torch.zeros(2, 3)))
 

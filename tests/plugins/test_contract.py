@@ -29,6 +29,8 @@ def parameters(**changes):
         (dict(parameters=parameters(features=torch.zeros(7, 2))), "lacks parameters of one length: it has 60 means, .*, 7 features; see"),
         (dict(parameters=parameters(carried=torch.tensor(1.0))), "lacks parameters of one length: it has 60 means, .*, single carried; see"),
         (dict(parameters=parameters(features=[1], offsets=None)), "lacks tensors as the parameters features, offsets; see"),
+        (dict(parameters=parameters(sh0=torch.zeros(60, 1, 3).half())), "lacks parameters of float32: it has sh0 of torch.float16; see"),
+        (dict(parameters=parameters(quats=torch.ones(60, 4, dtype=torch.int64))), "lacks parameters of float32: it has quats of torch.int64; see"),
         (dict(shared_parameters=lambda self: None), r"lacks shared_parameters\(\) that returns a dictionary; see"),
         (dict(shared_parameters=lambda self: {"w": [1]}), "lacks tensors as the parameters w; see"),
         (
@@ -55,6 +57,19 @@ def test_attributes_of_another_type_are_told_when_it_is_wrapped(name, value, kin
     setattr(odd, name, value)
     with pytest.raises(SettingsError, match=f"this Odd .* lacks {name} of the type {kind}; see"):
         wrap_model(odd)
+
+
+@pytest.mark.parametrize("name", ["traits", "trained"])
+def test_an_attribute_that_fails_is_told_by_the_name_of_its_class(name):
+    failing = property(lambda self: {}["level"], lambda self, value: None)
+    with pytest.raises(PluginError, match="this Odd failed: KeyError: 'level'"):
+        wrapped(**{name: failing})
+
+
+def test_whole_numbers_may_be_carried(tmp_path):
+    levels, unlike_3dgs = torch.ones(60, dtype=torch.int64), property(lambda self: Traits(), lambda self, traits: None)
+    leveled = model(parameters=parameters(carried=levels), traits=unlike_3dgs)
+    assert load_model(registered(tmp_path / "a.own", lambda path, iteration: leveled)).notes == []  # such as that float64 is slow
 
 
 def test_parameters_that_fail_are_told_by_name():

@@ -11,7 +11,7 @@ from mipmap_plugin import load_model, register_model, wrap_model
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.errors import OutputExists, PluginError
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models import API_VERSION, CERTAIN, Family, Match
+from mipmap_plugin.models import API_VERSION, CERTAIN, Family, Match, Traits
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.plugin_errors import naming_any
 from mipmap_plugin.splatting.rotations import rotations
@@ -140,6 +140,33 @@ def test_a_family_that_fails_before_the_work_begins_is_told_by_its_name(tmp_path
 def test_a_family_that_fails_where_views_are_looked_through_is_told_by_its_name():
     with pytest.raises(PluginError, match="family 'theirs' failed: KeyError: 'rows'"):
         wrapped(row_opacities=lambda self, views=(): {}["rows"]).refuse_undrawn()
+
+
+def with_copies(self, parameters):
+    VanillaModel.replace_parameters(self, {name: tensor.detach().clone() for name, tensor in parameters.items()})
+
+
+@pytest.mark.parametrize("replacing", [with_copies, lambda self, parameters: None])
+def test_a_family_that_takes_other_tensors_than_an_optimizer_moves_is_told(replacing):
+    with pytest.raises(PluginError, match=r"'theirs': replace_parameters\(\) has to keep the tensors themselves; means, .* are others then"):
+        wrapped(replace_parameters=replacing).adapt(0.5, **BRIEF | dict(steps=3), prune_every=1, min_opacity=0.6)
+
+
+class Leaving(Theirs):
+    """Of its splats, which move, every other one leaves."""
+
+    def __init__(self, *args):
+        super().__init__(*args)
+        self.traits = Traits(moves=True)
+
+    def gaussians(self, camera=None):
+        return super().gaussians(camera)[::2]
+
+
+def test_splats_that_move_and_are_not_those_of_the_rows_are_told():
+    said = r"'theirs': gaussians\(\) returned 30 splats for 60 rows of its parameters; return one for each, or say by the trait `rows`"
+    with pytest.raises(PluginError, match=said):
+        wrap_model(Leaving(tiny.model().parameters()), cameras=tiny.cameras(2), backend="reference").adapt(0.5, **BRIEF)
 
 
 def half_doubles(self, form, views=()):

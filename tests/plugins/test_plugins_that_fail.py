@@ -58,6 +58,13 @@ def test_a_recipe_that_ends_the_process_is_told_by_name():
         recipe("mine", 0.5)
 
 
+@pytest.mark.parametrize(("made", "said"), [([("steps", 3)], "a list"), ({3: "steps"}, "other keys than texts")])
+def test_a_recipe_that_returns_no_settings_by_name_is_told(made, said):
+    register_recipe("mine", lambda scale, network: made)
+    with pytest.raises(PluginError, match=rf"recipe 'mine' has to return a dict of settings by name; at x0\.5 it returned {said}$"):
+        recipe("mine", 0.5)
+
+
 def test_what_a_recipe_sets_wrong_is_told_by_its_name():
     register_recipe("mine", lambda scale, network: {"steps": -4})
     with pytest.raises(SettingsError, match=r"^recipe mine: setting steps: must be a whole number of at least 0, got -4"):

@@ -132,7 +132,14 @@ def test_targets_are_imported_only_when_used(module):
     assert things.get("lazy") == "made"
 
 
-@pytest.mark.parametrize(("text", "said"), [("raise ValueError('half')", "ValueError: half"), ("import sys; sys.exit(3)", "SystemExit: 3")])
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("raise ValueError('half')", "ValueError: half"),
+        ("import sys; sys.exit(3)", "SystemExit: 3"),
+        ("raise RuntimeError('no driver\\n  of any kind')", "RuntimeError: no driver of any kind$"),
+    ],
+)
 def test_a_module_that_fails_while_it_is_imported_is_a_broken_target(module, text, said):
     module(text)
     with pytest.raises(PluginError, match=f"cannot be loaded: {said}"):

@@ -205,6 +205,7 @@ WRONG = ("high", 2.0, -1, float("nan"))
         (custom_family(api_version=API_VERSION + 1), f"is written for API version {API_VERSION + 1}, but this package has API version {API_VERSION}"),
         (custom_family(recognize=lambda files: files.nothing), "has no attribute 'nothing'"),
         (custom_family(recognize=lambda files: True), "its recognize returns a bool; it has to be a Match or None"),
+        (custom_family(recognize=lambda files: {}["level"]), "'mine' failed: KeyError: 'level'"),
         (custom_family(recognize=damaged), "'mine' failed: this is no .mine file"),
         *((custom_family(recognize=lambda files, sure=sure: Match(sure, "I say so")), "sure must be a number from 0 to 1") for sure in WRONG),
         (custom_family(before="3dgs"), "`before` must be a tuple of names, got '3dgs'"),

@@ -11,6 +11,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.optimization.adam import Adam
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.models import contract
 from mipmap_plugin.models.base import CARRIED, SplatModel
 from mipmap_plugin.process import pool
 from mipmap_plugin.splatting.bands import lie_in_one_tensor, neighbors
@@ -90,6 +91,6 @@ def change_rows(model: SplatModel, optimizer: Adam, parameter: Callable[[str, Te
             state[key] = moment(value) if torch.is_tensor(value) and value.shape == old.shape else value
         optimizer.state[fresh[name]] = state
         groups[name]["params"] = [fresh[name]]
-    model.replace_parameters(fresh)
+    contract.replace_parameters(model, fresh)
     for name, tensor in fresh.items():
         tensor.requires_grad_(before[name].requires_grad)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from mipmap_plugin.models import contract
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.splatting.bands import neighbors
 
@@ -56,7 +57,7 @@ class Snapshot:
         if anew or any(tensor.shape != self.rows[name].shape for name, tensor in parameters.items()):
             copies = neighbors(self.rows)  # of colors, which are most of the memory
             copies |= {name: tensor.clone() for name, tensor in self.rows.items() if copies[name] is tensor}
-            model.replace_parameters({name: tensor.requires_grad_() for name, tensor in copies.items()})
+            contract.replace_parameters(model, {name: tensor.requires_grad_() for name, tensor in copies.items()})
         else:
             for name, tensor in parameters.items():
                 tensor.copy_(self.rows[name])

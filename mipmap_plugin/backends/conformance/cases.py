@@ -36,13 +36,13 @@ class HardCase(NamedTuple):
 Builder = Callable[[], HardCase]
 
 
-def view(width: int = 24, height: int = 18, *, cx: float | None = None, turned: bool = False) -> Camera:
+def view(width: int = 24, height: int = 18, *, cx: float | None = None, cy: float | None = None, turned: bool = False) -> Camera:
     """A camera at the origin that looks along +z, with fx != fy. Unless `turned`, a splat's depth equals its z exactly."""
     viewmat = torch.eye(4, dtype=torch.float64)
     if turned:
         viewmat[:3, :3] = rotations(torch.tensor([[1.0, 0.03, -0.06, 0.1]], dtype=torch.float64))[0]
         viewmat[:3, 3] = torch.tensor([0.1, -0.05, 0.2])
-    return Camera(width, height, 27.0, 25.0, width / 2 if cx is None else cx, height / 2, viewmat)
+    return Camera(width, height, 27.0, 25.0, width / 2 if cx is None else cx, height / 2 if cy is None else cy, viewmat)
 
 
 def crowd(n: int = 12, degree: int = 1, seed: int = 0) -> Gaussians:
@@ -233,6 +233,7 @@ CAMERAS = {
     "zoom-1/64": view().zoomed(1 / 64),
     "zoom-64": view().resized(4, 3).zoomed(64),
     "principal-point-outside": view(cx=-9.0),
+    "principal-point-off-center": view(cx=10.0, cy=12.0),
 }
 BAD = (math.nan, math.inf)
 FIELDS = ("means", "quats", "scales", "opacities", "sh")

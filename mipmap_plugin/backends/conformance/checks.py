@@ -15,7 +15,7 @@ from mipmap_plugin.backends.base import AdamStep, Backend, Needs, Rendered
 from mipmap_plugin.backends.conformance.cases import CASES, Builder, HardCase
 from mipmap_plugin.backends.conformance.tolerance import differing_gradients, differing_images, not_finite, tolerance_for
 from mipmap_plugin.backends.reference import ReferenceBackend, finite_rows
-from mipmap_plugin.errors import ShapeError
+from mipmap_plugin.errors import ShapeError, with_type
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.rotations import unit_quaternions
 
@@ -61,7 +61,7 @@ def check_backend(
         try:
             outcomes.append(check_case(backend, name, build, dtype=dtype, device=device))
         except Exception as error:  # whatever a third-party backend raises is the result
-            outcomes.append(Outcome(name, float("nan"), False, False, f"{type(error).__name__}: {error}"))
+            outcomes.append(Outcome(name, float("nan"), False, False, with_type(error)))
     return outcomes
 
 

@@ -42,7 +42,8 @@ def usual_fault(backend: Backend, *, dtype: torch.dtype = torch.float32, device:
     actual, expected = draw(backend, case, differentiate=differentiate), draw(ReferenceBackend(), exact)
     tolerance = tolerance_for(dtype)
     if not differing_images("image", actual.image, expected.image, tolerance):
-        return _of_gradients(actual, expected, tolerance)
+        opposite = not differing_images("alpha", actual.alpha, 1 - expected.alpha, tolerance)
+        return "its alpha is the transmittance; return 1 - transmittance" if opposite else _of_gradients(actual, expected, tolerance)
     alike = (said for said, mistaken in FAULTS.items() if not differing_images("image", actual.image, mistaken(exact), tolerance))
     return next(alike, "")
 
@@ -69,6 +70,18 @@ def _with_effects(case: HardCase, **changes: Any) -> Tensor:
 
 def _with_field(case: HardCase, field: str, change: Callable[[Tensor], Tensor]) -> Tensor:
     return _drawn(case._replace(gaussians=replace(case.gaussians, **{field: change(getattr(case.gaussians, field))})))
+
+
+def _with_settings(case: HardCase, **settings: Any) -> Tensor:
+    return _with_effects(case, settings=replace(case.effects.settings, **settings))
+
+
+def _flipped(case: HardCase, dimension: int) -> Tensor:
+    return _drawn(case).flip(dimension)
+
+
+def _of_one_focal_length(case: HardCase) -> Tensor:
+    return _drawn(case._replace(camera=replace(case.camera, fy=case.camera.fx)))
 
 
 def _shifted(case: HardCase, pixels: float) -> Tensor:
@@ -115,4 +128,10 @@ FAULTS: dict[str, Callable[[HardCase], Tensor]] = {
     "it reads quaternions as xyzw; they are wxyz": partial(_with_field, field="quats", change=lambda quats: quats.roll(1, 1)),
     "its rotations are the transposed ones": partial(_with_field, field="quats", change=lambda quats: quats * quats.new_tensor([1, -1, -1, -1])),
     "it takes scales for variances; they are standard deviations": partial(_with_field, field="scales", change=torch.sqrt),
+    "its image is upside down; y points down": partial(_flipped, dimension=0),
+    "its image is mirrored; x points right": partial(_flipped, dimension=1),
+    "its colors are in the order blue, green, red": partial(_flipped, dimension=2),
+    "it takes fx for fy": _of_one_focal_length,
+    "its splats end at three standard deviations; they end where alpha is 1/255": partial(_with_settings, radius=3.0),
+    "it sorts splats by their distance from the eye, and not by their depth": partial(_with_settings, radial=True),
 }
