@@ -95,7 +95,7 @@ def _send_again(number: int) -> None:
     if main is not None and hasattr(signal, "pthread_kill"):
         signal.pthread_kill(main, number)
     else:  # Windows: what the main thread waits for is not broken off
-        _thread.interrupt_main(number)
+        _thread.interrupt_main(signal.Signals(number))
 
 
 def presses() -> Presses:
