@@ -119,6 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The entry point; returns the exit code."""
     given = [*(sys.argv[1:] if arguments is None else arguments)]
     voice.take_any_text()
+    voice.take_any_width()
     if given == ["--version"]:
         print(f"mipmap-plugin {version('mipmap-plugin')}")
         return 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from types import ModuleType
@@ -26,6 +27,7 @@ from mipmap_plugin.splatting.packing import packed
 
 NO_NUMBA = f"it needs numba, which some Pythons and processors have no wheels of; where there are, {install('cpu')}"
 NO_FOLDER = "numba has no writable folder for compiled code; set the environment variable NUMBA_CACHE_DIR to one"
+DISABLED = "the variable NUMBA_DISABLE_JIT keeps numba from compiling; unset it"
 REINSTALL = "install it anew, where there are wheels by pip install --force-reinstall numba, which brings all that it needs"
 
 # Settings that kernels of screen filters that integrate do not read.
@@ -153,6 +155,8 @@ def missing() -> list[str]:
     """What this machine lacks to run the backend, and what to do; empty if nothing. It imports numba."""
     if importlib.util.find_spec("numba") is None:
         return [NO_NUMBA]
+    if os.environ.get("NUMBA_DISABLE_JIT", "0") != "0":
+        return [DISABLED]
     try:
         importlib.import_module("mipmap_plugin.backends.cpu_kernels.drawing")
     except Exception as error:  # numba built for another numpy, or without its compiler, may fail in any way

@@ -29,6 +29,9 @@ CONTROL = re.compile(r"[\0-\x08\x0b-\x1f\x7f-\x9f]")
 # The fewest columns that are left for a text after its indentation.
 LEAST_WIDTH = 20
 
+# The fewest columns of help. On fewer tyro gives each word a line, and below eight it never ends, and takes all memory.
+LEAST_COLUMNS = 40
+
 
 @dataclass(frozen=True)
 class Voice:
@@ -119,6 +122,12 @@ def take_any_text() -> None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8", errors="replace"))  # noqa: SIM115  for as long as the process lives
         elif isinstance(stream := getattr(sys, name), io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+
+
+def take_any_width() -> None:
+    """Let help be shown on a terminal of any width, or what COLUMNS says of it: one of fewer than `LEAST_COLUMNS` wraps the lines itself."""
+    if shutil.get_terminal_size().columns < LEAST_COLUMNS:
+        os.environ["COLUMNS"] = str(LEAST_COLUMNS)
 
 
 def options(words: Sequence[str]) -> tuple[list[str], bool, Path | None]:

@@ -181,7 +181,7 @@ def all_rows(model: Wrapped, judge: Evaluator, scales: Sequence[float], recipes:
     """
     viewer, rows = settings.get("viewer"), []
     model.targets(viewer)  # raise errors of the viewer, the recipes and the settings before any work
-    for name, scale in product(recipes, scales):
+    for name, scale in product(recipes or ["default"], scales):  # settings that nothing uses may be misspelled, too
         config_of(name, scale, settings)
     model.refuse_undrawn([view.camera for view in judge.views], min(scales))
     if doubt := of_another_scene(model, judge.views):

@@ -169,17 +169,18 @@ def _parsed(path: Path, lines: list[bytes], body: int) -> Header:
     for number, line in enumerate(lines, start=2):
         try:
             keyword, rest = [*line.decode("utf-8", "replace").strip().split(maxsplit=1), "", ""][:2]
+            words = line.decode("ascii", "backslashreplace").split()[1:]  # plyfile writes no other names, such as scalar fields may have
             if keyword == "format":
                 form = rest.split()[0]
                 if form not in BYTE_ORDER:
                     raise ValueError(form)
             elif keyword == "element":
-                name, count = rest.split()[:2]
+                name, count = words[:2]
                 elements.append(Element(name, int(count), ()))
                 if elements[-1].count < 0:
                     raise ValueError(count)
             elif keyword == "property":
-                elements[-1] = _with_property(elements[-1], rest.split())
+                elements[-1] = _with_property(elements[-1], words)
             elif keyword in ("comment", "obj_info"):
                 comments.append(rest)
             elif keyword:

@@ -23,8 +23,11 @@ SAME_S = 5.0
 # Seconds in which a further Ctrl-C counts as the same: an impatient hand presses twice, before it can see what the first one did.
 TWICE_S = 1.0
 
-# Seconds after which Ctrl-C is raised again, if it came where Python drops exceptions.
+# Seconds after which a signal is sent again, if it came where Python drops exceptions.
 AGAIN_S = 0.02
+
+# Where LLVM calls Python, through ctypes, when it has compiled a kernel: a Ctrl-C that is pressed while it compiles is heard there first.
+OF_LLVM = ("_raw_object_cache_notify", "_raw_object_cache_getbuffer")
 
 # The exit code of a process that was interrupted by Ctrl-C. Of one that another signal ended it is 128 more than the signal's number.
 INTERRUPTED = 130
@@ -58,16 +61,12 @@ class Ending:
 
         The first one may be lost, as where Python imports; then the second one has to be heard.
         """
-        if _is_dropped_in(frame):
-            again = threading.Timer(AGAIN_S, _press_again)
-            again.daemon = True
-            again.start()
-        elif self.presses.is_new() or not isinstance(sys.exc_info()[1], KeyboardInterrupt):
+        if not comes_again(number, frame) and (self.presses.is_new() or not isinstance(sys.exc_info()[1], KeyboardInterrupt)):
             raise KeyboardInterrupt
 
     def heard(self, number: int, frame: FrameType | None) -> None:
         """Do what Ctrl-C does now; also where that is ignored, as by what a script starts in the background."""
-        if not self._told.is_new():
+        if comes_again(number, frame) or not self._told.is_new():
             return
         self.code = 128 + number
         on_ctrl_c = signal.getsignal(signal.SIGINT)
@@ -76,21 +75,27 @@ class Ending:
         on_ctrl_c(number, frame)
 
 
-def _is_dropped_in(frame: FrameType | None) -> bool:
-    """Whether Python would drop an exception here and only print it: in a finalizer, such as runs for the memory of each picture."""
+def comes_again(number: int, frame: FrameType | None) -> bool:
+    """Whether Python would drop an exception in this frame and only print it; a signal of this number is then sent again a moment later.
+
+    So it is in a finalizer, such as runs for the memory of each picture, and in a function that LLVM calls.
+    """
     while frame is not None:
-        if frame.f_code.co_filename == weakref.__file__ or frame.f_code.co_name == "__del__":
+        if frame.f_code.co_filename == weakref.__file__ or frame.f_code.co_name in ("__del__", *OF_LLVM):
+            again = threading.Timer(AGAIN_S, _send_again, (number,))
+            again.daemon = True
+            again.start()
             return True
         frame = frame.f_back
     return False
 
 
-def _press_again() -> None:
+def _send_again(number: int) -> None:
     main = threading.main_thread().ident
     if main is not None and hasattr(signal, "pthread_kill"):
-        signal.pthread_kill(main, signal.SIGINT)
+        signal.pthread_kill(main, number)
     else:  # Windows: what the main thread waits for is not broken off
-        _thread.interrupt_main()
+        _thread.interrupt_main(signal.Signals(number))
 
 
 def presses() -> Presses:

@@ -71,3 +71,11 @@ def test_numba_is_not_missed_where_it_would_not_do(monkeypatch):
     monkeypatch.setattr(cpu, "missing", lambda: [cpu.NO_NUMBA])
     usual = Needs.of(gaussians(2, dtype=torch.float32), Effects(1), gradients=True)
     assert choose_backend("auto", usual, replace(usual, screen_filter="surfel"))[0].name == "reference"
+
+
+@pytest.mark.parametrize(("value", "missing"), [("1", [cpu.DISABLED]), ("0", [])])
+def test_a_numba_that_is_kept_from_compiling_is_told_of(monkeypatch, value, missing):
+    """Kernels are made of what numba makes, so that it was a traceback."""
+    pytest.importorskip("numba")
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", value)
+    assert cpu.missing.__wrapped__() == missing  # which is cached for the process

@@ -1,5 +1,6 @@
 """What numba is kept from doing to kernels, because it takes seconds at the first run and gains nothing."""
 
+import errno
 import operator
 import os
 import re
@@ -17,6 +18,7 @@ from numba.core.codegen import CPUCodegen, CPUCodeLibrary
 
 from mipmap_plugin.backends.cpu_kernels import binning, compiling
 from mipmap_plugin.backends.cpu_kernels.memory import scratch
+from mipmap_plugin.errors import MipmapPluginWarning
 
 
 @pytest.fixture(autouse=True)
@@ -93,6 +95,26 @@ def test_a_kernel_is_compiled_once_for_all_processes():
 def test_a_kernel_is_compiled_anew_when_any_source_has_changed(monkeypatch):
     called()
     monkeypatch.setattr(compiling, "sources", lambda: "others")
+    assert [sum(called().cache_hits.values()) for _ in range(2)] == [0, 1]
+
+
+def test_a_full_disk_costs_a_compilation_and_no_work(monkeypatch, tmp_path):
+    """A command ended at its first kernel, where the folder of compiled code was full, or beyond a quota."""
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch, pytest.warns(MipmapPluginWarning, match=rf"^{tmp_path}\S*: compiled code is not kept there \(No space"):
+        patch.setattr(compiling.IndexDataCacheFile, "_save_data", full)
+        called()
+    assert [sum(called().cache_hits.values()) for _ in range(2)] == [0, 1]
+
+
+@pytest.mark.parametrize("ending", ["nbi", "nbc"])
+def test_damaged_machine_code_is_compiled_anew(tmp_path, ending):
+    called()
+    for file in tmp_path.rglob(f"*.{ending}"):
+        file.write_bytes(b"")
     assert [sum(called().cache_hits.values()) for _ in range(2)] == [0, 1]
 
 

@@ -186,6 +186,12 @@ def test_evaluate_refuses_what_cannot_be_judged(run, model_folder, tmp_path):
     refused(run(*lpips, "--lpips", "alex"), f"{tmp_path} is a folder; give the file of the weights of alex in it")
 
 
+@pytest.mark.parametrize("setting", ["steps", "seed"])
+def test_evaluate_refuses_wrong_settings_that_no_recipe_is_there_to_use(run, model_folder, tmp_path, setting):
+    words = ["evaluate", model_folder, "--images", tiny.scene(tmp_path / "scene"), "--scale", "1/2", f"--{setting}", "-1"]
+    refused(run(*words), f"setting {setting}: must be a whole number", "got -1")
+
+
 def test_a_checkpoint_of_which_nothing_is_drawn_is_refused_before_the_work(run, tmp_path):
     faint = tiny.model()
     faint.parameters()["opacities"][:] = -8.0

@@ -214,6 +214,16 @@ def test_the_help_of_a_command_has_an_example(run, name):
     assert f"Example: mipmap-plugin {name} {EXAMPLES[name]}\n" in run(name, "--help")[1]
 
 
+@pytest.mark.parametrize("columns", [1, 6, 39])
+def test_help_on_a_very_narrow_terminal_is_that_of_a_narrow_one(run, monkeypatch, columns):
+    """tyro takes all memory for a column, and gives each word a line of its own for 39."""
+    helps = []
+    for each in (columns, 40):
+        monkeypatch.setenv("COLUMNS", str(each))
+        helps.append(run("adapt", "--help")[1])
+    assert helps[0] == helps[1] and "--time-budget-s" in helps[0]
+
+
 @pytest.mark.parametrize(("text", "name"), [("SuperSplat", "supersplat"), ("Luma", "luma"), ("spark", "spark"), ("Sparky", "Sparky")])
 def test_viewers_are_named_as_their_makers_write_them_too(text, name):
     assert read_viewer(text) == name

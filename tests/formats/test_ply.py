@@ -186,6 +186,18 @@ def test_writes_what_it_reads(tmp_path):
     assert {name: column.tobytes() for name, column in file.columns.items()} == {name: column.tobytes() for name, column in columns.items()}
 
 
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("coding", ["utf-8", "latin-1"])
+def test_names_of_columns_may_have_any_letters(tmp_path, coding, form):
+    """As scalar fields of CloudCompare do: plyfile refused to write them, at the end of an adaptation."""
+    path = write(tmp_path / "a.ply", {"x": np.zeros(2, np.float32), "hoehe": np.ones(2, np.float32), "laenge": np.ones(2, np.float32)}, form)
+    path.write_bytes(path.read_bytes().replace(b"hoehe", "höhe".encode(coding)).replace(b"laenge", "länge".encode(coding)))
+    held = read_ply(path).columns
+    assert [name.isascii() for name in held] == [True] * 3
+    again = read_ply(write_ply(tmp_path / "b.ply", held)).columns
+    assert {name: column.tolist() for name, column in again.items()} == {name: column.tolist() for name, column in held.items()}
+
+
 def test_refuses_comments_that_it_could_not_read_back(tmp_path):
     with pytest.raises(SettingsError, match=re.escape("131,072")):
         write_ply(tmp_path / "a.ply", {"x": np.zeros(1, np.float32)}, ["x" * 140_000])

@@ -137,6 +137,50 @@ def test_ctrl_c_while_an_object_is_deleted_is_heard_after_that(make):
         time.sleep(20)
 
 
+@pytest.fixture
+def compiling(monkeypatch):
+    """A function that compiles a kernel; LLVM tells Python of that, when a signal comes whose number it is given."""
+    numba, llvm = pytest.importorskip("numba"), pytest.importorskip("llvmlite.binding.executionengine")
+
+    def compile_kernel(number):
+        sent, copied = [], llvm.string_at
+
+        def told(*arguments):
+            if not sent:
+                sent.append(signal.raise_signal(number))
+            return copied(*arguments)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(llvm, "string_at", told)
+            numba.njit(lambda number: number + 1)(1)
+            assert sent
+        time.sleep(20)
+
+    return compile_kernel
+
+
+def test_ctrl_c_while_a_kernel_is_compiled_is_heard_after_that(compiling, capfd):
+    """LLVM's call of Python dropped it, and the command ended in a traceback, as the machine code was missing."""
+    with ends_as_by_ctrl_c(), pytest.raises(KeyboardInterrupt):
+        compiling(signal.SIGINT)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_signal_while_a_kernel_is_compiled_is_heard_after_that_also_where_ctrl_c_is_ignored(compiling):
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with pytest.raises(KeyboardInterrupt), ends_as_by_ctrl_c() as told:
+        compiling(signal.SIGTERM)
+    assert told.code == 128 + signal.SIGTERM
+
+
+def test_a_second_ctrl_c_while_a_kernel_is_compiled_ends_the_step_after_that(compiling, monkeypatch, capfd):
+    monkeypatch.setattr(signals, "TWICE_S", 0.0)
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        signal.raise_signal(signal.SIGINT)
+        compiling(signal.SIGINT)
+    assert capfd.readouterr().err == ""
+
+
 def test_ctrl_c_is_heard_where_the_first_was_lost():
     with pytest.raises(KeyboardInterrupt), ends_as_by_ctrl_c():
         with contextlib.suppress(KeyboardInterrupt):  # as Python does where it imports or finalizes

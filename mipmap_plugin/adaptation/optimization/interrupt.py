@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from mipmap_plugin.process.signals import is_ours, presses
+from mipmap_plugin.process.signals import comes_again, is_ours, presses
 
 
 @contextmanager
@@ -24,7 +24,7 @@ def interruptible() -> Iterator[Callable[[], bool]]:
 
     def record(number: int, frame: FrameType | None) -> None:
         nonlocal pressed
-        if not _interrupts(before, number, frame) or not known.is_new():
+        if comes_again(number, frame) or not _interrupts(before, number, frame) or not known.is_new():
             return
         if pressed:
             raise KeyboardInterrupt

@@ -3,7 +3,7 @@
 # numba has no types.
 # mypy: ignore-errors
 
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -18,6 +18,7 @@ from numba.core.errors import TypingError
 from numba.core.registry import CPUDispatcher
 from numba.core.runtime import rtsys
 
+from mipmap_plugin.errors import warn
 from mipmap_plugin.process.garbage import uncollected
 
 KERNEL = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
@@ -116,10 +117,27 @@ class _Cache(FunctionCache):
         self._cache_file = IndexDataCacheFile(self.cache_path, self._impl.filename_base, sources())
 
     def load_overload(self, signature, context):
-        """As numba's, which first loads all that a compiler needs, scipy too: that takes three times as long as the code itself."""
+        """As numba's, which first loads all that a compiler needs, scipy too: that takes three times as long as the code itself.
+
+        What cannot be read, or is damaged, as by a power cut, counts as nothing.
+        """
         rtsys.initialize(context)
-        with self._guard_against_spurious_io_errors():
+        try:
             return self._load_overload(signature, context)
+        except OSError:
+            return None
+        except Exception:  # of pickle, which raises any
+            with suppress(OSError):
+                self.flush()
+            return None
+
+    def save_overload(self, signature, data):
+        """As numba's; a full disk, or a file of another user, costs later processes a compilation, and not this one its work."""
+        try:
+            super().save_overload(signature, data)
+        except OSError as error:
+            elsewhere = "the variable NUMBA_CACHE_DIR names another folder"
+            warn(f"{self.cache_path}: compiled code is not kept there ({error.strerror or error}), so that each command compiles anew; {elsewhere}")
 
 
 @cache
