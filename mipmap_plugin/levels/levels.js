@@ -1,6 +1,7 @@
 // Shows a ladder of levels in three.js: in each frame the level that fits how large a pixel is at the scene. It was written by mipmap_plugin
 // with levels.json and the level files, which lie beside it. With Spark:
 //
+//     scene.add(new SparkRenderer({ renderer })) // once a page: without it Spark draws nothing
 //     const levels = await Levels.load(async (url) => {
 //       const splats = new SplatMesh({ url })
 //       await splats.initialized

@@ -89,7 +89,7 @@ BUILT_IN = (
     Viewer(
         "playcanvas-webgpu", "PlayCanvas and SuperSplat, WebGPU", "playcanvas 2.23.3, compute-gsplat-common, gsplat-hybrid-renderer",
         "classic", DILATION / 4, replace(PLAYCANVAS, bucketed=False, boxed=True, min_contribution=CONTRIBUTION), read_degrees=UP_TO_3,
-        unlike="among splats much larger than the image some pixels differ, 43 dB in all",
+        unlike="among splats much larger than the image some pixels differ, 43 dB in all; its order is by buckets of depth, and by chance in each",
     ),
     SUPERSPLAT_VIEWER,
     Viewer("playcanvas-aa", "PlayCanvas and SuperSplat with antiAlias", PLAYCANVAS_SOURCE, "mip", DILATION / 4, PLAYCANVAS, read_degrees=UP_TO_3),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,9 @@ from mipmap_plugin.demo.run import embedded
 from mipmap_plugin.levels.manifest import read_manifest
 
 pytestmark = pytest.mark.browser
+
+# The page that shows a ladder in Spark, as users copy it.
+STREAMING = Path(__file__).parents[2] / "docs" / "streaming.md"
 
 WHITE = (1.0, 1.0, 1.0)
 
@@ -91,3 +95,11 @@ def test_a_level_looks_as_we_say_where_it_is_shown(page: Page, ladder: Path, lev
     assert page.shown()[0] == level == int(np.argmax(likeness))
     assert likeness[level] > ALIKE
     assert sorted(likeness)[-2] < likeness[level] - APART
+
+
+def test_the_page_of_the_docs_draws_a_ladder(browser: Browser, ladder: Path) -> None:
+    """Spark says nothing where a page lacks what draws its splats."""
+    written = re.search(r"With Spark:\n\n```js\n(.*?)```", STREAMING.read_text(), re.DOTALL)
+    assert written
+    (ladder / "page.js").write_text(written[1].replace("./DIR/", "./"))
+    assert browser.alone("spark-docs", ladder)
