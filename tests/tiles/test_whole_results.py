@@ -274,10 +274,3 @@ def test_the_command_says_how_to_go_on_with_several_scales(job, capsys, monkeypa
     for further, again in (([], "again to go on"), (two, "again to go on"), ([*two, "--overwrite"], "with --skip-existing")):
         assert main([*options, *further]) == 130
         assert again in capsys.readouterr().err
-
-
-def test_help_says_what_a_time_budget_is_of(capsys):
-    with pytest.raises(SystemExit):
-        main(["adapt", "--help"])
-    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "Maximum number of seconds for each file; with --tiles for each tile, and tiles are adapted one after the other without --jobs" in said
