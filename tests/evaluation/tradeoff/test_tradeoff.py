@@ -56,8 +56,8 @@ def test_a_backend_is_measured_that_is_registered_by_another_name_than_its_own()
     class Theirs(ReferenceBackend):
         name = "theirs"
 
-    with BACKENDS.temporarily(mine=Theirs):
-        points = list(measure(wrapped(), base_itself(wrapped(), 1 / 2, 1), 1 / 2, replace(PLAN, recipes=("instant",), backends=("mine",), repeats=1)))
+    BACKENDS.add("mine", Theirs)
+    points = list(measure(wrapped(), base_itself(wrapped(), 1 / 2, 1), 1 / 2, replace(PLAN, recipes=("instant",), backends=("mine",), repeats=1)))
     assert {point.backend for point in points} == {"theirs"}
 
 
