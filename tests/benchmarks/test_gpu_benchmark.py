@@ -1,7 +1,5 @@
 """The GPU benchmark where there is no GPU: its parts on a processor, and the one sentence that it ends with."""
 
-from __future__ import annotations
-
 import runpy
 import sys
 import time

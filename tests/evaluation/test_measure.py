@@ -1,7 +1,5 @@
 """What every table measures by: one clock, one list of baselines under one set of names, and poses compared."""
 
-from __future__ import annotations
-
 import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor

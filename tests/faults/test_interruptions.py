@@ -1,7 +1,5 @@
 """A full disk, Ctrl-C and kill -9, in the middle of adapting and of saving: what was there stays, and no half file has a final name."""
 
-from __future__ import annotations
-
 import os
 import resource
 import signal

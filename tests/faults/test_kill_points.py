@@ -1,7 +1,5 @@
 """Killed in any state of the disk: the old or the new output is there, whole, and the next run leaves nothing else."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Numbers out of range: one sentence each, before any work; and nothing that is not finite is ever saved."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Cameras of DyNeRF and HyperNeRF scenes, where 4DGaussians takes them from, against its own arithmetic in NumPy."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What is adapted in tiles is one whole scene, of one base, at one scale or at several, by the library and by the command."""
 
-from __future__ import annotations
-
 import json
 import sys
 from contextlib import nullcontext

@@ -1,7 +1,5 @@
 """Families with a `filter_3D` column in viewers, which ignore it: how they render the file, and files written for them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import tiny
