@@ -220,6 +220,13 @@ def test_the_suite_says_what_a_backend_declares_wrong(part, value, said):
     type("Suite", (BackendSuite,), {"backend": type("Odd", (ReferenceBackend,), {"speed": 0.5})()})().test_declares_itself()
 
 
+def test_what_a_backend_does_not_have_is_skipped():
+    suite = type("Suite", (BackendSuite,), {"backend": ReferenceBackend()})()
+    for check in (suite.test_views_in_one_call_are_those_drawn_alone, suite.test_steps_follow_the_gradients):
+        with pytest.raises(pytest.skip.Exception):
+            check()
+
+
 class OfDoubles(OfDegree0):
     capabilities = replace(OfDegree0.capabilities, dtypes=frozenset({torch.float64}))
 
