@@ -6,8 +6,8 @@ import importlib
 import operator
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from functools import lru_cache
 from importlib.metadata import Distribution, EntryPoint, distributions, entry_points
 from typing import Any
@@ -38,15 +38,6 @@ class Registry:
         if not replace and self._targets.get(name, target) is not target and self._targets[name] != target:
             raise SettingsError(f"{self.group}: the name {name!r} is taken; pass replace=True to override it")
         self._targets[name] = target
-
-    @contextmanager
-    def temporarily(self, **targets: Any) -> Iterator[None]:
-        """Register `targets` by name until the block ends, replacing others of these names; then restore the registry."""
-        before, self._targets = self._targets, {**self._targets, **targets}
-        try:
-            yield
-        finally:
-            self._targets = before
 
     def names(self) -> list[str]:
         """All known names, registered and installed, sorted."""

@@ -59,8 +59,10 @@ def ctrl_c_is_heard():
 
 @pytest.fixture(autouse=True)
 def nothing_that_is_registered_stays():
-    with BACKENDS.temporarily(), FAMILIES.temporarily(), UPSAMPLERS.temporarily(), VIEWERS.temporarily(), RECIPES.temporarily():
-        yield
+    before = {registry: dict(registry._targets) for registry in (BACKENDS, FAMILIES, UPSAMPLERS, VIEWERS, RECIPES)}
+    yield
+    for registry, targets in before.items():
+        registry._targets = targets
 
 
 @pytest.fixture(autouse=True)

@@ -71,12 +71,6 @@ class Pool:
             self._collect()
             self._spare.clear()
 
-    @property
-    def spare_bytes(self) -> int:
-        with self._lock:
-            self._collect()
-            return sum(map(len, self._spare))
-
 
 def _new_block(size: int) -> np.ndarray:
     return np.empty(size + CACHE_LINE, np.uint8)

@@ -29,8 +29,8 @@ MISSING = next((name for name in ("numba", CPU) if importlib.util.find_spec(name
 SINGLE = TOLERANCE[torch.float32]
 
 
-class TestReference(BackendSuite):
-    backend = ReferenceBackend()
+def test_the_reference_in_float32_is_that_in_float64():
+    assert [outcome.message for outcome in check_backend(ReferenceBackend(), CASES) if not outcome.passed] == []
 
 
 @pytest.mark.skipif(MISSING is not None, reason=f"{MISSING} is not there")
@@ -218,6 +218,13 @@ def test_the_suite_says_what_a_backend_declares_wrong(part, value, said):
     with pytest.raises(AssertionError, match=said):
         type("Suite", (BackendSuite,), {"backend": declared})().test_declares_itself()
     type("Suite", (BackendSuite,), {"backend": type("Odd", (ReferenceBackend,), {"speed": 0.5})()})().test_declares_itself()
+
+
+def test_what_a_backend_does_not_have_is_skipped():
+    suite = type("Suite", (BackendSuite,), {"backend": ReferenceBackend()})()
+    for check in (suite.test_views_in_one_call_are_those_drawn_alone, suite.test_steps_follow_the_gradients):
+        with pytest.raises(pytest.skip.Exception):
+            check()
 
 
 class OfDoubles(OfDegree0):

@@ -3,7 +3,7 @@
 
 import pytest
 import torch
-from families import Change, Quality, Row, main, table
+from families import Change, Quality, Row, table
 from family_scenes import FAMILIES, Pictures, views
 
 from mipmap_plugin.adaptation.target.resize import resize
@@ -41,8 +41,3 @@ def test_the_table_has_no_empty_cell():
     assert [cell.strip() for cell in lines[2].strip("|").split("|")] == [
         "A", "10 ms", "2 ms", "2.2 s", "20 ms", "1.0 s", *["10.0 → 20.0 · 9.0 → 19.5"] * 2, "none",
     ]  # fmt: skip
-
-
-def test_an_unknown_family_is_refused(tmp_path):
-    with pytest.raises(SystemExit, match="there is no family 2dgs; known are 3dgs"):
-        main(("2dgs",), tmp_path)

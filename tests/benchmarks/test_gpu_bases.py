@@ -1,7 +1,5 @@
 """Bases that gsplat trains, without gsplat: its rasterizer by our own backend, and no refinement."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from pathlib import Path

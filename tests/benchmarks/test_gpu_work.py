@@ -1,7 +1,5 @@
 """The GPU benchmark's pieces of work: what breaks or takes too long is a line, and the rest goes on. On a processor."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import time

@@ -1,7 +1,5 @@
 """Report pages, and a browser that opens them."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path

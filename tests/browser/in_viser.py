@@ -4,8 +4,6 @@
         image = drawn(*shown, camera, background=(1.0, 1.0, 1.0))
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence

@@ -5,8 +5,6 @@
 takes the picture of docs/view.md.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 import signal

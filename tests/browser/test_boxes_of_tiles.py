@@ -1,7 +1,5 @@
 """3D Tiles of the real splat-transform: the box of the tileset is where the splats of a tile lie."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import struct

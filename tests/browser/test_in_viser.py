@@ -1,7 +1,5 @@
 """What our renderer says that viser shows, and what it shows."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from importlib.util import find_spec

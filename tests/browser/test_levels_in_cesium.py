@@ -1,7 +1,5 @@
 """3D Tiles of a ladder in a real Cesium: at which zooms it changes levels, and what these look like."""
 
-from __future__ import annotations
-
 import math
 import shutil
 from dataclasses import replace

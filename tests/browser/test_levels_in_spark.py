@@ -1,7 +1,5 @@
 """A ladder in a page of three.js, with Spark, by the module that lies beside its levels: which level it shows, and what that looks like."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

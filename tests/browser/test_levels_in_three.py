@@ -1,7 +1,5 @@
 """The module of a ladder in a bare page of three.js: what cameras, canvases and groups do to its zoom, and files that are not there."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

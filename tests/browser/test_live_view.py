@@ -1,7 +1,5 @@
 """The live view in a real browser: it shows the scene, zooms, switches, adapts and saves, and Ctrl-C ends it."""
 
-from __future__ import annotations
-
 import io
 import json
 import shutil

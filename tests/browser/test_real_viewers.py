@@ -1,7 +1,5 @@
 """What our renderer says a viewer shows, and what it shows. One browser for all: starting it and compiling shaders cost more than a view."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The report page in a real browser: what the pointer, a finger and the keyboard do, narrow and dark screens, and the figures that it shows."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The plots of the report page in a real browser: fronts, ladders and curves, with the figures that they show."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """A ladder as Streamed SOG in a real PlayCanvas engine: which level it shows from which distance, and what that looks like."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -49,8 +49,8 @@ def test_inspect_tells_of_a_backend_that_fails_and_says_the_rest(run, model_fold
     def fails(self, gaussians, camera, effects):
         raise RuntimeError("no driver")
 
-    with BACKENDS.temporarily(fast=type("Fast", (CpuBackend,), {"speed": 99, "render": fails, "__module__": "theirs"})):
-        code, out, _ = run("inspect", model_folder)
+    BACKENDS.add("fast", type("Fast", (CpuBackend,), {"speed": 99, "render": fails, "__module__": "theirs"}))
+    code, out, _ = run("inspect", model_folder)
     assert code == 0 and re.search(r"\nviewers: +not drawn: backend 'fast' \(taken as the fastest.*\) failed: RuntimeError: no driver\n", out)
 
 

@@ -1,7 +1,5 @@
 """The embedded scene: small enough to ship, whole, and gained by adapting."""
 
-from __future__ import annotations
-
 from importlib.resources import files
 from pathlib import Path
 

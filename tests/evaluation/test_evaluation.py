@@ -1,16 +1,15 @@
 """Quality against photographs: which truths are taken, and the rows of a table."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import tiny
 import torch
 
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.evaluation import measure, photographs
+from mipmap_plugin.evaluation import photographs
 from mipmap_plugin.evaluation.evaluate import Evaluator, Row, all_rows, evaluator_of, means, training_free_rows
-from mipmap_plugin.evaluation.judged import JudgedView, judged_views
+from mipmap_plugin.evaluation.judged import judged_views
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.evaluation.published import PUBLISHED, published
@@ -133,14 +132,6 @@ def test_what_is_scored_is_the_last_state_and_what_is_held_out_the_best(model, s
     assert (held_out.settings.returns, scored.settings.returns, scored.returned) == ("best", "last", "the last state")
 
 
-def test_an_upsampler_has_a_row_of_its_own(model, scene, monkeypatch):
-    gray = {"bicubic": 0.0, "mine": 0.999}
-    monkeypatch.setattr(measure, "find_upsampler", lambda name: lambda image, size: image.new_full((*size, 3), gray[name]))
-    views = [JudgedView(tiny.cameras(1)[0], torch.ones(96, 128, 3), Path("photograph.png"))]
-    rows = {row.name: row.psnr_db for row in training_free_rows(model, Evaluator(views, PROTOCOLS["P3"]), 2, "mine")}
-    assert rows["base, resized"] < 1 and rows["base upsampled by mine"] > 50
-
-
 def test_a_row_is_not_called_held_out_where_a_judged_pose_was_adapted_to(scene):
     """Without `eval` in cfg_args every camera of the checkpoint counts as one of training."""
     judged = [replace(camera, split="train", name="another") for camera in tiny.cameras(2, seed=9)]
@@ -171,11 +162,6 @@ def test_the_mean_over_scenes(model, scene):
 def test_the_mean_over_scenes_whose_worst_viewers_differ():
     rows = [Row(f"base in {viewer}, worst of 2", 1 / 2, "P3", psnr, None, 0.0, 1.0, 9) for viewer, psnr in (("spark", 20.0), ("classic", 30.0))]
     assert [(row.name, row.psnr_db, row.scene) for row in means(rows)] == [("base, worst of 2 viewers", 25.0, "mean of 2")]
-
-
-def test_a_checkpoint_without_cameras_cannot_be_judged(scene):
-    with pytest.raises(SettingsError, match="has no cameras, so its base scale is not known; give its model folder"):
-        evaluate(wrap_model(tiny.model()), scene, [1], [], "P3")
 
 
 @pytest.mark.parametrize("name", ["P2", None])

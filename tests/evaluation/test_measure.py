@@ -1,7 +1,5 @@
 """What every table measures by: one clock, one list of baselines under one set of names, and poses compared."""
 
-from __future__ import annotations
-
 import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
@@ -20,7 +18,7 @@ from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.evaluation.evaluate import Evaluator, training_free_rows
 from mipmap_plugin.evaluation.judged import judged_views
 from mipmap_plugin.evaluation.measure import baselines, resized_base, views_seen, warm_stopwatch, warm_up
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol
+from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.evaluation.tradeoff.measuring import measure
 from mipmap_plugin.evaluation.tradeoff.points import Plan
 from mipmap_plugin.evaluation.tradeoff.truth import photographs
@@ -38,16 +36,6 @@ def wrapped(**options):
 
 
 # Rivals
-
-
-def test_clamped_samples_give_the_row_of_supersampling_whose_samples_a_screen_clamps():
-    bright = tiny.gaussians(60)
-    model = wrap_model(VanillaModel.from_gaussians(replace(bright, sh=3 * bright.sh), TrainedScale()), cameras=tiny.cameras(1), backend="reference")
-    [row] = [each for each in baselines(model, 1 / 4, "area") if each.name == "supersampling, 4 x 4"]
-    [view] = tiny.cameras(1)
-    clamped, plain = (model.render(view.zoomed(1 / 4), 1 / 4, "scaled", 4, clamped=on).image for on in (True, False))
-    torch.testing.assert_close(clamped, row.render(view), atol=1e-5, rtol=0)
-    assert (clamped - plain.clamp(0, 1)).abs().max() > 1 / 255
 
 
 @pytest.mark.parametrize(
@@ -109,14 +97,6 @@ def test_samples_are_clamped_before_they_are_averaged():
     view = model.cameras[0]
     assert model.render(view).image.max() > 1.2
     torch.testing.assert_close(show["supersampling, 4 x 4"](view), show["base, resized"](view), atol=1e-5, rtol=0)
-
-
-def test_the_base_resized_is_the_ceiling_of_what_is_judged_by_the_same_filter(tmp_path):
-    """The photographs are the base's own images: only the filter is between them and the truth."""
-    model, scene = wrapped(), load_scene(tiny.scene(tmp_path / "scene", count=30))
-    judge = Evaluator(judged_views(scene, model.cameras, model.background), Protocol("floats", "pil-bicubic", eight_bit=False))
-    rows = {row.name: row.psnr_db for row in training_free_rows(model, judge, 1 / 4)}
-    assert rows["base, resized"] > max(rows[name] for name in rows if name != "base, resized") + 10
 
 
 # The clock

@@ -176,12 +176,6 @@ def test_a_damaged_photograph_does_not_matter_to_cameras(tmp_path, recwarn):
     assert len(wrap_model(tiny.ply(tmp_path / "base.ply"), cameras=scene).cameras) == 4 and not recwarn
 
 
-def test_photographs_that_a_zoom_in_is_adapted_to_are_warned_of(tmp_path, recwarn):
-    base = wrap_model(tiny.model(), cameras=tiny.cameras(4))
-    base.adapt(2.0, images=tiny.scene(tmp_path / "scene", train=tiny.cameras(4), seed=5), steps=1)
-    assert any("check --images" in str(warning.message) for warning in recwarn)
-
-
 @pytest.mark.parametrize(
     ("size", "resolution", "told"),
     [

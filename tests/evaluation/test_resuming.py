@@ -140,8 +140,9 @@ def test_what_another_recipe_of_that_name_made_is_measured_again(folder, monkeyp
     place = f"mipmap_plugin.evaluation.{module}.adapt_alone"
     monkeypatch.setattr(place, lambda *args, **settings: made.append(args) or adapt_alone(*args, **settings))
     for crispness in (0.0, 0.0, 0.5):
-        with RECIPES.temporarily(mine=lambda scale, network, value=crispness: {"steps": 0, "views": "given", "crispness": value}):
-            assert main([*words, "--output", str(folder / "rows"), "--overwrite"]) == 0
+        settings = {"steps": 0, "views": "given", "crispness": crispness}
+        RECIPES.add("mine", lambda scale, network, settings=settings: settings, replace=True)
+        assert main([*words, "--output", str(folder / "rows"), "--overwrite"]) == 0
         counts.append(len(made))
     assert 0 < counts[0] == counts[1] and counts[2] == 2 * counts[0]
 

@@ -3,8 +3,6 @@
 What a kill leaves is what is on the disk: it is killed once for each state of that. Ctrl-C is heard by what runs on: before each call.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -1,7 +1,5 @@
 """Files crafted to hang, exhaust memory or execute code: each is refused quickly, in one sentence, with memory in proportion to its size."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,14 +1,10 @@
 """A full disk, Ctrl-C and kill -9, in the middle of adapting and of saving: what was there stays, and no half file has a final name."""
 
-from __future__ import annotations
-
-import multiprocessing
 import os
 import resource
 import signal
 import subprocess
 import sys
-import time
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -117,29 +113,6 @@ def test_ctrl_c_while_saving_leaves_the_old_output_and_nothing_else(tmp_path, mo
 
 
 # kill -9
-
-
-def save_for_ever(path: str) -> None:
-    torch.set_num_threads(1)
-    models = [tiny.model(count) for count in (20, 3000)]
-    while True:
-        for model in models:
-            model.save(path, provenance={}, overwrite=True)
-
-
-@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="needs fork")
-@pytest.mark.parametrize("name", ["new.ply", "new"])
-def test_a_process_killed_while_it_saves_leaves_a_whole_file(tmp_path, name):
-    out = tmp_path / name
-    tiny.model(20).save(out, provenance={})
-    for number in range(12):
-        process = multiprocessing.get_context("fork").Process(target=save_for_ever, args=(str(out),))
-        process.start()
-        time.sleep(0.03 + 0.007 * number)
-        os.kill(process.pid, signal.SIGKILL)
-        process.join()
-        assert out.exists() and len(load_model(out)) in (20, 3000)
-    assert [path.name for path in tmp_path.iterdir()] == [name]  # what the dead left was put right
 
 
 RUN = """

@@ -1,7 +1,5 @@
 """Killed in any state of the disk: the old or the new output is there, whole, and the next run leaves nothing else."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil
@@ -78,6 +76,17 @@ def test_saving_broken_off_leaves_the_old_or_the_new_output(tmp_path, name, by, 
             break
         replacing.check()
     assert number > 10
+
+
+def test_a_file_by_itself_is_replaced_in_one_step(tmp_path):
+    """One with a report takes two."""
+    out, models = tmp_path / "new.ply", [tiny.model(count) for count in (20, 30)]
+    for number in count(1):
+        models[0].save(out, provenance={}, overwrite=True)
+        if not killed(number, lambda: models[1].save(out, provenance={}, overwrite=True), tmp_path):
+            break
+        assert len(load_model(out)) in (20, 30)
+    assert number > 5
 
 
 @pytest.mark.parametrize("name", some(FOLDERS, ["cfg_args"]))

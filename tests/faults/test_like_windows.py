@@ -1,7 +1,5 @@
 """What Windows does otherwise, simulated: it refuses to move and remove files in use, names other characters and capitals alike, and ends pipes."""
 
-from __future__ import annotations
-
 import errno
 import io
 import os

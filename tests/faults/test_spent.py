@@ -1,7 +1,5 @@
 """What an output was made from is removed with its appearance: killed before any call, a command leaves the one or the other, and can be repeated."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The state that a run keeps to go on from: one for each run, of this base and these settings, and its failure fails no run."""
 
-from __future__ import annotations
-
 import itertools
 import os
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """What a command or a model may write to: never the base or a part of it, by no name; and what would fail at the end is refused first."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path

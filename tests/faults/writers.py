@@ -1,7 +1,5 @@
 """Samples of what is saved, one of each writer: what is adapted from them, where that goes, and what a folder holds."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A place that cannot be written to: one sentence that says which, why, and what to do, before any work."""
 
-from __future__ import annotations
-
 import errno
 import os
 from unittest.mock import Mock

@@ -1,7 +1,5 @@
 """Damage to files, all from a seed: to bytes, to text, and to the objects that JSON and torch files hold."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import random

@@ -1,7 +1,5 @@
 """Damaged files and odd commands: each ends well or in one sentence, in seconds, in a bounded memory, and nothing is run, lost or left."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os

@@ -1,7 +1,5 @@
 """The command line's words, sound ones and others, all from a seed; and the folder that they speak of."""
 
-from __future__ import annotations
-
 import os
 import random
 from pathlib import Path

@@ -3,8 +3,6 @@
 Run as `python worker.py FOLDER FIRST LAST NAME...`: damages FIRST to LAST of each sample, in FOLDER; of COMMANDS it runs as many.
 """
 
-from __future__ import annotations
-
 import contextlib
 import faulthandler
 import hashlib

@@ -65,14 +65,15 @@ def test_what_only_this_process_knows_is_told_before_others_are_asked(tmp_path, 
     job = job_of(tmp_path)
     record = replace(find_family("3dgs"), name=name, recognize=lambda files: Match(1.0, "all"))  # of what is no family only the name counts
     told = f"'{name}' is registered in this process alone, and other processes, .*; register it by an entry"
-    with registry.temporarily(**{name: record}), pytest.raises(SettingsError, match=told):
+    registry.add(name, record, replace=True)
+    with pytest.raises(SettingsError, match=told):
         next(in_workers([replace(job, **changes(job))], 2, None))
 
 
 def test_networks_that_each_process_reads_for_itself_are_no_concern(tmp_path):
     job = job_of(tmp_path, settings={"upsampler": "net"}, network=tmp_path / "net.pt")
-    with UPSAMPLERS.temporarily(net=len):
-        refuse_elsewhere([job])
+    UPSAMPLERS.add("net", len)
+    refuse_elsewhere([job])
 
 
 @pytest.fixture

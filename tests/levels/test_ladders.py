@@ -223,12 +223,6 @@ def test_no_level_advises_to_leave_out_the_viewer_that_a_ladder_needs(monkeypatc
     assert not any(advice in str(each.message) for each in recwarn) and advice not in str([level.adapted.report.notes for level in ladder.levels])
 
 
-def test_the_command_does_not_advise_to_leave_out_the_viewer_that_it_needs(tmp_path, capsys):
-    base = moving.write_deformable(tmp_path / "base")
-    assert cli.main(["levels", str(base), "--viewer", "spark", "--output", str(tmp_path / "ladder")]) == 2
-    assert "levels are files for viewers, so adapt it to one scale at a time" in capsys.readouterr().err
-
-
 def test_the_command_makes_a_ladder_and_prints_it(tmp_path, capsys):
     base = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12), count=12)
     options = ["--viewer", "antialiased", "--coarsest", "1/2", "--ratio", "2", "--recipe", "instant", "--views", "given"]

@@ -185,11 +185,6 @@ def command(tmp_path):
     return [*words, "--recipe", "instant", "--backend", "cpu", "--threads", "1"]
 
 
-def test_the_command_makes_levels_by_distance(tmp_path, capsys, command):
-    assert cli.main([*command, "--coarsest", "1/4"]) == 0
-    assert "lodBaseDistance" in capsys.readouterr().out and (tmp_path / "out" / "level_1.ply").is_file()
-
-
 @pytest.mark.parametrize("by", ["distance", "zoom"])
 def test_a_ladder_that_ends_within_its_first_band_has_one_level(tmp_path, capsys, command, by):
     assert cli.main([by if word == "distance" else word for word in (*command, "--coarsest", "1", "--report", "--json")]) == 0
@@ -201,7 +196,8 @@ def test_a_ladder_that_ends_within_its_first_band_has_one_level(tmp_path, capsys
 def test_the_page_of_walks_has_the_figures_of_their_manifest(tmp_path, capsys, monkeypatch, command):
     monkeypatch.setattr("mipmap_plugin.levels.distance.yardstick.VIEWS", 1)  # as where only one sees something
     assert cli.main([*command, "--coarsest", "1/4", "--report"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == f"page: {tmp_path / 'out' / 'report.html'}"
+    said = capsys.readouterr().out
+    assert "lodBaseDistance" in said and said.splitlines()[-1] == f"page: {tmp_path / 'out' / 'report.html'}"
     record, manifest = record_of(tmp_path / "out" / "report.html"), json.loads((tmp_path / "out" / MANIFEST).read_text())
     assert record["ladder"] == manifest and f"on walks backwards at worst {manifest['worst_db']:.1f} dB" in record["lead"]
     scales = [zoom["scale"] for zoom in record["zooms"]]

@@ -8,9 +8,6 @@ import torch
 from oracle import rotation_one
 from zip_files import archive
 
-from mipmap_plugin.backends.cpu import CpuBackend
-from mipmap_plugin.backends.reference import ReferenceBackend
-from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import CheckpointError, SettingsError
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.state_dict import read_state_dict
@@ -115,14 +112,6 @@ def test_a_camera_without_a_time_renders_time_0(tmp_path):
     timeless, start, later = (model.gaussians(moving.at(time)).means for time in (None, 0.0, 1.0))
     assert torch.equal(timeless, start) and not torch.equal(start, later)
     assert any("without a time shows the moment 0" in note for note in model.notes)
-
-
-def test_the_fast_backend_draws_what_the_reference_draws(tmp_path):
-    pytest.importorskip("numba")
-    model, camera = load_model(moving.write_deformable(tmp_path / "m")), moving.at(0.4)
-    with torch.no_grad():
-        fast, exact = (backend.render(model.gaussians(camera), camera, Effects(1)).image for backend in (CpuBackend(), ReferenceBackend()))
-    torch.testing.assert_close(fast, exact, atol=2e-4, rtol=0)
 
 
 # Saving

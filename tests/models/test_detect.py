@@ -170,14 +170,6 @@ def test_point_cloud_is_not_a_splat(tmp_path):
         detect(tmp_path / "points3D.ply")
 
 
-@pytest.mark.parametrize("lost", ["opacity", "scale_0", "rot_0"])
-def test_splats_without_one_of_their_columns_are_not_called_a_point_cloud(tmp_path, lost):
-    columns = splat_columns(3)
-    del columns[lost]
-    with pytest.raises(CheckpointError, match=f"it lacks the columns {lost}; export it again"):
-        detect(write(tmp_path / "a.ply", columns))
-
-
 def test_real_companions_are_named(shared_data):
     folder = shared_data / "checkpoints"
     for path, sentence in {

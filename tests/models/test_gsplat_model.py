@@ -12,7 +12,6 @@ from torch_checkpoints import Hostile, activated, aim, equal, gsplat_folder, nor
 
 from mipmap_plugin.errors import CheckpointError, SceneError
 from mipmap_plugin.evaluation.metrics import psnr
-from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.formats.yaml_scalars import read_scalars
 from mipmap_plugin.models import load_model
@@ -75,7 +74,7 @@ def test_a_lone_file_is_classic_with_a_note(tmp_path):
     torch.save({"step": 7, "splats": splats()}, tmp_path / "lone.pt")
     model = load_model(tmp_path / "lone.pt")
     assert model.trained.screen_filter == "classic"
-    assert "cfg.yml is not beside" in model.notes[0]
+    assert "cfg.yml is not beside" in model.notes[0] and "2DGS" in model.notes[0]
 
 
 @pytest.mark.parametrize("target", ["out", "out.pt"])
@@ -160,12 +159,6 @@ def test_a_viewer_that_reads_no_file_of_its_project_gets_a_ply(tmp_path, write, 
     assert adapted_name(write(tmp_path / "run", splats(4)), 1 / 4, viewer) == f"run_x0.25{ending}"
 
 
-def test_a_ply_is_written_on_request(tmp_path):
-    raw = splats()
-    saved = load_model(gsplat_folder(tmp_path / "r", raw)).save(tmp_path / "out.ply", provenance={})
-    assert np.array_equal(read_ply(saved).columns["scale_1"], raw["scales"][:, 1].numpy())
-
-
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
@@ -200,12 +193,6 @@ def test_flat_splats_are_surfels_whose_third_scale_stays_as_it_is(tmp_path):
     torch.testing.assert_close(again.parameters()["scales"][:, :2], model.parameters()["scales"][:, :2] + math.log(2))
     assert torch.equal(again.parameters()["scales"][:, 2], model.parameters()["scales"][:, 2])
     assert again.trained == model.trained
-
-
-def test_without_options_a_note_says_that_flat_splats_look_alike(tmp_path):
-    folder = gsplat_folder(tmp_path / "r", splats())
-    (folder / "cfg.yml").unlink(missing_ok=True)
-    assert any("2DGS" in note and "cfg.yml" in note for note in load_model(folder).notes)
 
 
 # The normalized world

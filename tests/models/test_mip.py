@@ -55,12 +55,6 @@ def ball(family: str = "mip", count: int = 60) -> MipModel:
     return MipModel(family, VanillaModel.from_gaussians(base, trained), base.scales.min(1).values.clamp(0.02, 0.04))
 
 
-def test_a_file_in_the_other_byte_order_is_read_alike(tmp_path):
-    little, big = (load_model(ply_files.write(tmp_path / f"{form}.ply", splats(), form)) for form in ("binary_little_endian", "binary_big_endian"))
-    camera = tiny.cameras(1)[0]
-    assert torch.equal(little.gaussians(camera).scales, big.gaussians(camera).scales)
-
-
 def test_t4_smoothing():
     scales = torch.tensor([[0.2, 0.1, 0.05]], dtype=torch.float64)
     smoothed, opacities = smooth_3d(scales, torch.sigmoid(scales.new_ones(1)), scales.new_tensor([0.03]))

@@ -16,7 +16,6 @@ from mipmap_plugin.adaptation.start.surfel_form import visible_area, widened_for
 from mipmap_plugin.backends import choose_backend, survey
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.reference import ReferenceBackend
-from mipmap_plugin.cli import main
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.formats.ply import read_ply
@@ -257,9 +256,3 @@ def test_a_live_object_is_recognized_by_its_two_scales():
     assert isinstance(model, SurfelModel) and model.trained.screen_filter == "surfel"
     assert torch.equal(model.parameters()["scales"][:, :2], live._scaling)
     assert (model.parameters()["scales"][:, 2] == FLAT).all()
-
-
-def test_inspect_names_the_family(tmp_path, capsys):
-    main(["inspect", str(folder(tmp_path / "model"))])
-    printed = capsys.readouterr().out
-    assert "2dgs" in printed and "surfel, 0.5 px²" in printed

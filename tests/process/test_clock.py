@@ -1,7 +1,5 @@
 """What is timed on a GPU is timed until the GPU has done it."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

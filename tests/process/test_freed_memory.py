@@ -1,7 +1,5 @@
 """Memory that commands keep."""
 
-from __future__ import annotations
-
 import ctypes
 import platform
 import subprocess

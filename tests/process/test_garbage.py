@@ -1,7 +1,5 @@
 """Garbage collection is off where it only costs time, and nowhere else."""
 
-from __future__ import annotations
-
 import gc
 import subprocess
 import sys

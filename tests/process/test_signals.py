@@ -1,7 +1,5 @@
 """A command that is told to end, by `timeout`, a cluster or a closed terminal, does what Ctrl-C does: nothing temporary stays."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import os

@@ -1,7 +1,5 @@
 """At which size, and through which lens, other projects trained on the photographs of a scene."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

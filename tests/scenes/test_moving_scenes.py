@@ -1,7 +1,5 @@
 """Cameras of DyNeRF and HyperNeRF scenes, where 4DGaussians takes them from, against its own arithmetic in NumPy."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from dataclasses import replace
@@ -199,11 +197,3 @@ def test_an_array_whose_header_is_cut_off_is_refused(tmp_path):
     path.write_bytes(whole.replace(b"'shape': (4, 17)", b"'shape': (4, 17 "))
     with pytest.raises(SceneError, match="is not an array"):
         load_scene(path.parent)
-
-
-def test_a_moving_model_adapts_to_these_cameras_at_their_times(tmp_path):
-    """Adaptation takes the time of a view as it is."""
-    from mipmap_plugin.adaptation.views import with_times
-
-    views, note = with_times(load_scene(dynerf(tmp_path / "s")).split("train"), seed=0)
-    assert note == "at their own times" and torch.tensor([view.time for view in views]).unique().numel() == 300

@@ -1,7 +1,5 @@
 """Lens distortion: in the undistorted photograph a point of the world is where the pinhole camera projects it."""
 
-from __future__ import annotations
-
 import json
 import sys
 

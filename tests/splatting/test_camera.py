@@ -29,33 +29,16 @@ def camera() -> Camera:
     return Camera(64, 48, 70.0, 72.0, 32.0, 24.0, VIEWMAT, "view", "test", 0.5)
 
 
-def fields_of_view(camera: Camera) -> tuple[float, float]:
-    return 2 * math.atan(camera.width / (2 * camera.fx)), 2 * math.atan(camera.height / (2 * camera.fy))
-
-
 def project(camera: Camera, point: tuple[float, float, float]) -> tuple[float, float]:
     x, y, z, _ = (camera.viewmat @ torch.tensor([*point, 1.0], dtype=torch.float64)).tolist()
     return camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-
-
-def test_field_of_view_of_the_test_vector(camera):
-    assert fields_of_view(camera) == pytest.approx((0.857556055, 0.643501109), abs=1e-9)
 
 
 def test_center_of_the_test_vector(camera):
     assert camera.center.tolist() == pytest.approx([-2.0, 0.25, -3.5], abs=1e-7)
 
 
-def test_projection_of_the_test_vector(camera):
-    assert project(camera, (0.1, 0.2, 0.3)) == pytest.approx((37.758091993, 21.765879776), abs=1e-6)
-
-
-@pytest.mark.parametrize("factor", [1 / 64, 1 / 8, 0.37, 1.0, 1.7, 8.0])
-def test_zoom_keeps_the_field_of_view(camera, factor):
-    assert fields_of_view(camera.zoomed(factor)) == pytest.approx(fields_of_view(camera), rel=1e-12)
-
-
-@pytest.mark.parametrize("factor", [1 / 8, 0.37, 4.0])
+@pytest.mark.parametrize("factor", [1 / 64, 1 / 8, 0.37, 1.0, 4.0])
 def test_zoom_scales_every_pixel_position(camera, factor):
     zoomed = camera.zoomed(factor)
     x, y = project(camera, (0.1, 0.2, 0.3))

@@ -1,7 +1,5 @@
 """The file system of Windows, as strict as it is there: what is open or mapped is not moved, replaced or removed, and no folder is opened."""
 
-from __future__ import annotations
-
 import errno
 import mmap
 import os

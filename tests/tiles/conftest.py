@@ -1,7 +1,5 @@
 """Small scenes, as a job and cut into tiles."""
 
-from __future__ import annotations
-
 import pytest
 import tiny
 from cut_scenes import cut_in_three

@@ -1,7 +1,5 @@
 """Scenes that are cut into tiles, for tests."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from mipmap_plugin.formats.ply import read_ply, write_ply

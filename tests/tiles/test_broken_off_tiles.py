@@ -1,7 +1,5 @@
 """A run in tiles that is broken off goes on to the same bytes, and what another request left is not touched."""
 
-from __future__ import annotations
-
 import os
 from contextlib import contextmanager
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A tile in its halo, which stays as it is: what it shows, and what a step moves."""
 
-from __future__ import annotations
-
 import importlib.util
 import weakref
 from dataclasses import replace

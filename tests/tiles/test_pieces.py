@@ -1,7 +1,5 @@
 """A scene in pieces: every splat in one core, exact pictures from the disk, and parts that are joined."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """What a run in tiles begins with, and its sweeps: no start is worse than the base, and what does harm is undone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """What cannot be cut into tiles is refused in a sentence, and what is left out is told."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from types import SimpleNamespace

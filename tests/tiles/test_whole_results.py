@@ -1,7 +1,5 @@
 """What is adapted in tiles is one whole scene, of one base, at one scale or at several, by the library and by the command."""
 
-from __future__ import annotations
-
 import json
 import sys
 from contextlib import nullcontext
@@ -274,10 +272,3 @@ def test_the_command_says_how_to_go_on_with_several_scales(job, capsys, monkeypa
     for further, again in (([], "again to go on"), (two, "again to go on"), ([*two, "--overwrite"], "with --skip-existing")):
         assert main([*options, *further]) == 130
         assert again in capsys.readouterr().err
-
-
-def test_help_says_what_a_time_budget_is_of(capsys):
-    with pytest.raises(SystemExit):
-        main(["adapt", "--help"])
-    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "Maximum number of seconds for each file; with --tiles for each tile, and tiles are adapted one after the other without --jobs" in said

@@ -1,7 +1,5 @@
 """Families with a `filter_3D` column in viewers, which ignore it: how they render the file, and files written for them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import tiny
@@ -12,14 +10,12 @@ from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import BackendUnavailable, OutputExists, SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
-from mipmap_plugin.evaluation.viewer_differences import viewer_differences
 from mipmap_plugin.formats import splat_transform as exchange
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.cfg_args import read_cfg_args
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.mip import MipModel
 from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.splatting.viewers import find_viewer
 from mipmap_plugin.wrap import Wrapped, wrap_model
@@ -123,11 +119,6 @@ def test_the_base_is_neither_changed_nor_overwritten(tmp_path):
             adapted.save(path, overwrite=True)
 
 
-def test_one_file_for_every_viewer(tmp_path):
-    adapted = wrapped(tmp_path).adapt(1 / 2, viewer="portable", **BRIEF)
-    assert load_model(adapted.save(tmp_path / "made.ply")).family == "3dgs"
-
-
 def test_an_exchange_format_is_refused_for_its_own_project_only(tmp_path, monkeypatch):
     monkeypatch.setattr(exchange, "find_tool", lambda: ["splat-transform"])
     base = wrapped(tmp_path)
@@ -153,11 +144,6 @@ def test_splats_with_a_filter_may_be_merged(tmp_path, viewer):
     assert len(base.adapt(1 / 4, viewer=viewer, steps=0, most_splats=48).model) <= 48 < len(base.model)
 
 
-def test_without_a_viewer_the_file_stays_one_of_mip_splatting(tmp_path):
-    adapted_model = wrapped(tmp_path).adapt(1 / 4, **BRIEF)
-    assert isinstance(adapted_model.model, MipModel) and (adapted_model.effects.screen_filter, adapted_model.effects.eps2d) == ("mip", 0.1)
-
-
 def test_splats_that_were_fused_elsewhere_leave_the_kernel_size_behind_too(tmp_path):
     plain = {name: column for name, column in splats().items() if name != "filter_3D"}
     base = wrap_model(folder(tmp_path / "model", columns=plain), cameras=tiny.cameras())
@@ -172,22 +158,6 @@ def test_who_draws_the_base_has_its_filter_too(tmp_path, monkeypatch):
     monkeypatch.setattr(ReferenceBackend, "lacking", lambda self, needs: no_analytic if needs.screen_filter == "analytic" else lacking(self, needs))
     with pytest.raises(BackendUnavailable, match="it does not integrate"):
         wrap_model(folder(tmp_path / "model", "analytic"), cameras=tiny.cameras(), backend="reference").adapt(1, viewer="classic", **BRIEF)
-
-
-def test_inspect_says_how_viewers_show_it(tmp_path):
-    pytest.importorskip("numba")
-    line = viewer_differences(wrap_model(folder(tmp_path / "model"), cameras=tiny.cameras()))
-    assert line.startswith("spark ") and "playcanvas" in line
-
-
-def test_the_command_converts_it(tmp_path, capsys):
-    base = folder(tmp_path / "model")
-    write_cameras(base / "cameras.json", tiny.cameras())
-    words = ["adapt", base, "--scale", "1", "--viewer", "spark", "--recipe", "instant"]
-    assert main([str(word) for word in words]) == 0
-    what, where = capsys.readouterr().out.splitlines()
-    assert what.startswith("x1 in spark: ") and where.startswith(str(tmp_path / "model_x1_spark"))
-    assert load_model(tmp_path / "model_x1_spark").family == "3dgs"
 
 
 def test_the_command_says_that_a_file_without_a_viewer_is_for_its_own_project(tmp_path, capsys):

@@ -46,13 +46,6 @@ def test_an_adapted_model_is_drawn_as_its_viewer_does(viewer):
     assert (adapted.model.trained.screen_filter, adapted.model.trained.eps2d) == (adapted.effects.screen_filter, adapted.effects.eps2d)
 
 
-def test_the_report_and_the_file_say_what_viewer_they_are_for(tmp_path):
-    adapted = wrapped().adapt(1 / 4, viewer="spark", **BRIEF)
-    assert adapted.report.viewer == "spark"
-    assert provenance_of(read_ply(adapted.save(tmp_path / "new.ply")).comments)["viewer"] == "spark"
-    assert wrapped().adapt(1 / 4, recipe="instant").report.provenance()["viewer"] is None
-
-
 # By the near plane of a base's training, a viewer that draws from another depth on.
 OTHER_NEAR = {0.2: "gsplat", 0.01: "classic"}
 
@@ -106,11 +99,6 @@ def test_a_base_whose_near_planes_were_looked_at_is_freed_at_once():
     with uncollected():
         del model
         assert freed() is None
-
-
-def test_an_unknown_viewer_is_told_the_known_ones():
-    with pytest.raises(SettingsError, match=r"there is no viewer 'sparc'; choose from .*playcanvas.*spark"):
-        wrapped().adapt(1 / 4, viewer="sparc")
 
 
 def test_files_of_a_family_that_keeps_its_filter_are_for_no_viewer():

@@ -11,7 +11,6 @@ import torch
 from mipmap_plugin.adaptation.views import with_times
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.models import load_model
 from mipmap_plugin.scenes import jittered
 from mipmap_plugin.wrap import wrap_model
 
@@ -62,11 +61,6 @@ def test_adapting_gains_and_leaves_the_network_as_it_was(tmp_path, family, scale
     assert "without a time of their own, spread over 0..1" in adapted.report.views
     adapted.save(tmp_path / "out")
     assert (tmp_path / "out" / network).read_bytes() == (tmp_path / "m" / network).read_bytes()
-
-
-def test_a_model_on_another_device_moves_as_before(tmp_path):
-    model = load_model(moving.write_deformable(tmp_path / "m"))
-    assert torch.equal(model.to("cpu").gaussians(moving.at(0.5)).means, model.gaussians(moving.at(0.5)).means)
 
 
 @pytest.mark.parametrize("write", [moving.write_deformable, moving.write_hexplane])

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 from statistics import fmean
 from types import SimpleNamespace
@@ -56,15 +57,10 @@ def test_portable_is_every_built_in_viewer_but_the_further_ones_with_the_usual_o
     assert viewers_for("portable")[0] == "classic" and viewers_for("spark") == ("spark",)
 
 
-def test_several_viewers_draw_no_picture():
-    with pytest.raises(SettingsError, match=r"portable is a group of viewers, .*; name one of them: classic, antialiased, mip"):
-        find_viewer("portable")
-
-
 def test_the_command_does_not_draw_as_several(tmp_path, capsys):
     words = ["render", tiny.folder(tmp_path / "base"), "--output", tmp_path / "out", "--viewer", "portable"]
     assert cli.main([str(word) for word in words]) == 2
-    assert "portable is a group of viewers" in capsys.readouterr().err
+    assert re.search("portable is a group of viewers, .*; name one of them: classic, antialiased, mip", capsys.readouterr().err)
     assert not (tmp_path / "out").exists()
 
 

@@ -112,8 +112,3 @@ def test_render_says_whose_cameras_these_are(base, tmp_path, capsys):
 def test_render_says_nothing_of_a_base(base, tmp_path, capsys):
     assert main(["render", str(base), "--output", str(tmp_path / "pictures")]) == 0
     assert "its base" not in capsys.readouterr().out
-
-
-def test_inspect_says_whose_cameras_these_are(base, tmp_path, capsys):
-    assert main(["inspect", str(instant(base, tmp_path / "adapted.ply")), "--no-viewers"]) == 0
-    assert f", of its base, in {base}" in capsys.readouterr().out

@@ -15,7 +15,6 @@ from mipmap_plugin.backends import BACKENDS
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.commands.resuming import resumable
 from mipmap_plugin.errors import OutputExists, SettingsError
-from mipmap_plugin.evaluation.measure import baselines
 from mipmap_plugin.evaluation.tradeoff import measuring
 from mipmap_plugin.evaluation.tradeoff.files import KEPT, Folder, facts, table, write
 from mipmap_plugin.evaluation.tradeoff.front import Tradeoff
@@ -57,8 +56,8 @@ def test_a_backend_is_measured_that_is_registered_by_another_name_than_its_own()
     class Theirs(ReferenceBackend):
         name = "theirs"
 
-    with BACKENDS.temporarily(mine=Theirs):
-        points = list(measure(wrapped(), base_itself(wrapped(), 1 / 2, 1), 1 / 2, replace(PLAN, recipes=("instant",), backends=("mine",), repeats=1)))
+    BACKENDS.add("mine", Theirs)
+    points = list(measure(wrapped(), base_itself(wrapped(), 1 / 2, 1), 1 / 2, replace(PLAN, recipes=("instant",), backends=("mine",), repeats=1)))
     assert {point.backend for point in points} == {"theirs"}
 
 
@@ -140,12 +139,6 @@ def test_a_filter_that_the_backend_lacks_is_named(monkeypatch):
     one = measuring.Point(1 / 4, "base", "base", "reference", 30, ms_per_frame=measuring.NOTHING)
     found = Tradeoff(1 / 4, "dB", [one], [note])
     assert table(found).endswith(note) and facts([found], complete=True)["scales"][0]["notes"] == [note]
-
-
-@pytest.mark.parametrize(("scale", "samples"), [(1 / 4, [2, 4]), (4, [2])])
-def test_samples_finer_than_the_pixels_of_the_base_are_left_out(scale, samples):
-    names = [baseline.name for baseline in baselines(wrapped(), scale, "area", samples=(2, 4, 8))]
-    assert [name for name in names if name.startswith("supersampling")] == [f"supersampling, {n} x {n}" for n in samples]
 
 
 def test_a_run_is_looked_at_on_its_way_and_at_its_end(points):

@@ -53,10 +53,6 @@ def test_records_with_absurd_numbers_count_as_none(tmp_path, digits):
     assert load_vanilla(file).trained.screen_filter == "classic"
 
 
-def test_header_says_default_for_the_classic_filter(tmp_path):
-    assert "SplatRenderMode: default" in read_ply(raw_model().save(tmp_path / "a.ply", provenance={})).comments
-
-
 @pytest.mark.parametrize(("screen_filter", "eps2d", "compensates"), [("classic", 0.075, False), ("mip", 0.1, True), ("analytic", 0.3, False)])
 def test_web_splat_reads_the_filter_in_its_own_words(screen_filter, eps2d, compensates):
     """It takes the first comment in which each word is, and refuses a file where what follows the last = there is no truth value, or number."""
