@@ -26,7 +26,7 @@ def test_what_is_no_recipe_is_named():
     with pytest.raises(PluginError, match="recipe 'mine' is of type int"):
         recipe("mine", 2)
     register_recipe("mine", lambda scale, network: None, replace=True)
-    with pytest.raises(PluginError, match="recipe 'mine' has to return a dict of settings; at x2 it returned a NoneType"):
+    with pytest.raises(PluginError, match="recipe 'mine' has to return a dict of settings by name; at x2 it returned a NoneType"):
         recipe("mine", 2)
 
 

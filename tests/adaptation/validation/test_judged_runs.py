@@ -27,6 +27,7 @@ from mipmap_plugin.wrap import Interrupted, wrap_model
 
 # So bold that every step does harm.
 BOLD = {name: 1000 * rate for name, rate in recipe("default", SCALE).rates.model_dump().items()}
+STILL = dict.fromkeys(BOLD, 0.0)
 HARMFUL = dict(steps=6, extra_views=2, check_every=2, merge_to=1.0, warm_up=0, patience=None, rates=BOLD)
 
 
@@ -47,7 +48,7 @@ def test_harmful_steps_return_nothing_worse_than_the_base_and_the_start(monkeypa
     if not steered:
         monkeypatch.setattr(Steering, "is_harmful", lambda self, psnr, rising: False)
     model = wrapped()
-    started, adapted = model.adapt(scale, **{**HARMFUL, "steps": 0}), model.adapt(scale, **HARMFUL)
+    started, adapted = model.adapt(scale, **{**HARMFUL, "rates": STILL}), model.adapt(scale, **HARMFUL)
     for camera in tiny.cameras(3, seed=9):  # of neither set
         small = camera.zoomed(scale)
         images = model.render(small).image, started.render(small).image, adapted.render(small).image
@@ -69,7 +70,7 @@ def test_steps_that_were_taken_back_are_marked():
     adapted = model.adapt(SCALE, **HARMFUL)
     assert [(point.step, point.taken_back) for point in adapted.report.curve] == [(0, False), (2, True), (4, True), (6, True)]
     assert len({point.validation_db for point in adapted.report.curve}) == 1  # what the run went on with each time
-    assert same(adapted.model, model.adapt(SCALE, **{**HARMFUL, "rates": dict.fromkeys(BOLD, 0.0)}).model)
+    assert same(adapted.model, model.adapt(SCALE, **{**HARMFUL, "rates": STILL}).model)
 
 
 def test_a_run_goes_on_gently_after_harm():
