@@ -20,7 +20,7 @@ from mipmap_plugin.splatting.bands import lie_in_one_tensor, neighbors
 ADAM_EPS = 1e-15
 
 # The rate of the SH bands above 0 rises from this fraction over so many steps: Adam's first steps are as long by chance as by what many views agree
-# on, and most numbers of a splat are of these bands. Worth 1 to 3 dB to runs of 5 to 10 steps, nothing to long ones (docs/recipes_found.md).
+# on, and most numbers of a splat are of these bands. Worth up to 3 dB to runs of 5 to 10 steps, nothing to long ones (docs/recipes_found.md).
 FIRST_FRACTION, RISING_STEPS = 0.25, 16
 
 
