@@ -38,8 +38,8 @@ AWAY = 1.35
 # Training views from whose directions the camera looks.
 VIEWS = (0, 40)
 
-# dB between our picture of a level and the engine's, which SOG's rounding is in; 47 to 56 were measured. Of other levels it is at least so much less.
-ALIKE, APART = 43.0, 10.0
+# dB between our picture of a level and the engine's, which SOG's rounding is in; 43 to 55 were measured. Of other levels it is at least so much less.
+ALIKE, APART = 42.0, 10.0
 
 # The same of pictures of a ladder by distance, most of which mix levels: 43 to 54 were measured.
 MIXED = 42.0
