@@ -38,8 +38,9 @@ AWAY = 1.35
 # Training views from whose directions the camera looks.
 VIEWS = (0, 40)
 
-# dB between our picture of a level and the engine's, which SOG's rounding is in; 43 to 55 were measured. Of other levels it is at least so much less.
-ALIKE, APART = 42.0, 10.0
+# dB between our picture of each level and the engine's, which SOG's rounding is in; 43, 47 and 52 were measured. Of other levels it is at least so
+# much less.
+ALIKE, APART = (42.0, 45.0, 50.0), 10.0
 
 # The same of pictures of a ladder by distance, most of which mix levels: 43 to 54 were measured.
 MIXED = 42.0
@@ -138,7 +139,7 @@ def test_a_level_looks_as_we_say_from_where_it_is_shown(
     for each in read_manifest(ladder)["levels"]:
         ours = render_model(load_model(ladder / each["file"]), backend, camera, base.target("playcanvas")).image.clamp(0, 1).numpy()
         likeness.append(float(-10 * np.log10(np.square(ours - real).mean())))
-    assert likeness[level] > ALIKE
+    assert likeness[level] > ALIKE[level]
     assert all(other < likeness[level] - APART for number, other in enumerate(likeness) if number != level)
 
 
