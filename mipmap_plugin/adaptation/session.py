@@ -22,7 +22,7 @@ from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
-from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Quality, Validation, split_validation
+from mipmap_plugin.adaptation.optimization.validation import COMPARED_WITH_BASE, HARM_DB, WINDOW, Quality, Validation, split_validation
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, color_limits, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, option_note, simulated, versions
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer, ends_run
@@ -32,6 +32,7 @@ from mipmap_plugin.adaptation.start.candidates import best_start
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
 from mipmap_plugin.adaptation.start.matcher import UNMATCHED
 from mipmap_plugin.adaptation.start.problem import StartProblem
+from mipmap_plugin.adaptation.start.splitting import in_parts
 from mipmap_plugin.adaptation.target.detail import DetailLoss, unused_upsampler
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import median_target
@@ -47,9 +48,6 @@ from mipmap_plugin.models.health import doubts_in
 from mipmap_plugin.process import pool, threads
 from mipmap_plugin.process.clock import now
 from mipmap_plugin.progress import announced
-
-# A zoom-in is validated against the base's own image, whatever it is adapted to.
-COMPARED_WITH_BASE = {"compare_at": "base", "quantize_truth": False}
 
 
 class Session:
@@ -147,10 +145,11 @@ class Session:
             may_lose=self.config.merging_costs if len(self.drawn.targets) > 1 and self.config.steps else 0.0,
         )  # fmt: skip
         if (finer := self.finer) is None:
-            return [from_base]
+            return [in_parts(from_base)]
         from_level = from_base.from_level(finer, lambda: self.drawn.copied(finer.model, shared=True))
-        both = [from_level, from_base] if finer.learned else [from_base, from_level]
-        return both if finer.converts else [from_level]
+        if not finer.converts:
+            return [from_level]
+        return [from_level, in_parts(from_base)] if finer.learned else [in_parts(from_base), from_level]
 
     def _with_more_bands(self, start: SplatModel) -> SplatModel:
         """The start with the SH bands that steps can give it and that it has room for, which are drawn from now on."""

@@ -42,6 +42,9 @@ MIN_VIEWS = 4
 # an object is left as it is (at x1/4 24.0 dB in place of 28.1, at x2 38.7 in place of 43.1), and 8 take 0.1 to 0.8 s more.
 MIN_VIEWS_OF_START = 8
 
+# A zoom-in is validated against the base's own image, whatever it is adapted to.
+COMPARED_WITH_BASE = {"compare_at": "base", "quantize_truth": False}
+
 # px: validation uses at most this much of a view along each side, so that large images stay cheap.
 WINDOW = 768
 
