@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.start.blend_weights import weighed
+from mipmap_plugin.adaptation.start.clock import start_clock
 from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.camera import Camera, evenly
@@ -34,6 +35,9 @@ ROUNDS = 6
 # There are at most so many times as many splats as before; those that lose most are split first.
 MOST = 1.25
 
+# The part of a start's time, in a time budget, that looking for such splats may take.
+PART = 1 / 4
+
 # The three parts of a splat: their longest axis and the distance of the outer ones from the middle, in its standard deviations.
 SHORTER, APART = 0.6, 0.9
 
@@ -42,10 +46,10 @@ SHORTER, APART = 0.6, 0.9
 def in_parts(problem: StartProblem) -> StartProblem:
     """The same problem with large splats of the base in parts, where the target leaves them out and it looks better by that.
 
-    Not in a time budget, and not where blend weights cannot be measured.
+    Not where blend weights cannot be measured, and only as far as a time budget allows.
     """
     cut = _cuts(problem)
-    if cut is None or not problem.has_blend_weights or problem.config.time_budget_s is not None:
+    if cut is None or not problem.has_blend_weights:
         return problem
     whole, parts, views = problem.base(), problem.base(), evenly(problem.views, LOOKED_AT)
     splats = whole.gaussians(views[0]).detach()
@@ -88,8 +92,15 @@ def _split(splats: Gaussians, views: Sequence[Camera], problem: StartProblem, cu
     """The splats, those that lose much in parts."""
     most = int(MOST * len(splats))
     least = LEAST_LOST * sum(view.width * view.height for view in views) / len(views)
+    clock = start_clock(problem)
+    if clock.limited:
+        with clock.timing("look", 1 / len(views)):
+            _lost(splats, views[:1], problem, cut)
     for _ in range(ROUNDS):
-        lost = _lost(splats, views, problem, cut)
+        if not clock.allows("look", part=PART):
+            break
+        with clock.timing("look"):
+            lost = _lost(splats, views, problem, cut)
         rows = lost.topk(min((most - len(splats)) // 2, int((lost > least).sum()))).indices
         if len(rows) == 0:
             break
