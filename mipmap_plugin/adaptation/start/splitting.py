@@ -26,8 +26,8 @@ from mipmap_plugin.splatting.rotations import rotations
 # What is left out of so many views, drawn at this fraction of their size, tells.
 LOOKED_AT, SIZE = 24, 0.5
 
-# The part of a picture, on average over the views, that a splat may lose.
-LEAST_LOST = 1e-4
+# The part of a picture, on average over the views, that a splat may lose, and all that lose more may lose together.
+LEAST_LOST, ENOUGH = 1e-4, 3e-3
 
 # A splat is split at most so often: six times makes its longest axis a twentieth as long.
 ROUNDS = 6
@@ -91,7 +91,7 @@ def _cuts(problem: StartProblem) -> tuple[Effects, Effects] | None:
 def _split(splats: Gaussians, views: Sequence[Camera], problem: StartProblem, cut: tuple[Effects, Effects]) -> Gaussians:
     """The splats, those that lose much in parts."""
     most = int(MOST * len(splats))
-    least = LEAST_LOST * sum(view.width * view.height for view in views) / len(views)
+    picture = sum(view.width * view.height for view in views) / len(views)
     clock = start_clock(problem)
     if clock.limited:
         with clock.timing("look", 1 / len(views)):
@@ -100,9 +100,10 @@ def _split(splats: Gaussians, views: Sequence[Camera], problem: StartProblem, cu
         if not clock.allows("look", part=PART):
             break
         with clock.timing("look"):
-            lost = _lost(splats, views, problem, cut)
-        rows = lost.topk(min((most - len(splats)) // 2, int((lost > least).sum()))).indices
-        if len(rows) == 0:
+            lost = _lost(splats, views, problem, cut) / picture
+        much = lost > LEAST_LOST
+        rows = lost.topk(min((most - len(splats)) // 2, int(much.sum()))).indices
+        if len(rows) == 0 or lost[much].sum() < ENOUGH:
             break
         stays = torch.ones_like(lost, dtype=torch.bool).index_fill(0, rows, False)
         splats = splats[stays].joined(thirds(splats[rows]))
