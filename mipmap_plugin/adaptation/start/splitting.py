@@ -32,8 +32,8 @@ LEAST_LOST, ENOUGH = 1e-4, 3e-3
 # A splat is split at most so often: six times makes its longest axis a twentieth as long.
 ROUNDS = 6
 
-# There are at most so many times as many splats as before; those that lose most are split first.
-MOST = 1.25
+# There are at most so many times as many splats as before; those that lose most are split first. With 1.25 an object under a sky has no dB more.
+MOST = 1.1
 
 # The part of a start's time, in a time budget, that looking for such splats may take.
 PART = 1 / 4
