@@ -65,6 +65,12 @@ def read_straight(path: str | Path) -> np.ndarray | None:
     return pixels if pixels.shape[2] == 4 else None
 
 
+def read_rgba(path: str | Path) -> np.ndarray:
+    """The 8-bit RGBA [H, W, 4] of a file, as it is stored; opaque where it has no transparency. Raises SceneError."""
+    pixels = _pixels(path)
+    return pixels if pixels.shape[2] == 4 else np.dstack([pixels, np.full(pixels.shape[:2], 255, np.uint8)])
+
+
 def has_alpha(path: str | Path) -> bool:
     """Whether an image file has transparency, from its header alone. Raises SceneError."""
     with _opened(path) as image:

@@ -134,7 +134,7 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
         inputs = [completed(source, Path(folder)) if kind == "sog" else source]
         if path.name == LOD_META:
             inputs += environment_of(source)
-        if reason := _run(tool, inputs, plain):
+        if reason := run_tool(tool, inputs, plain):
             if answer([*tool, "--version"]) is None:  # as where packages that it needs are missing, or with an old Node.js
                 raise CheckpointError(f"{path} is {name}, which {TOOL} reads, but {TOOL} does not start ({reason}); run: {INSTALL}")
             raise CheckpointError(f"{path} is {name}, but {TOOL} does not read it ({reason}); export it again")
@@ -174,7 +174,7 @@ def _convert(tool: Sequence[str], plain: Path, converted: Path, path: Path) -> N
     kind = next(kind for kind, (_, suffix) in EXCHANGE.items() if converted.name.endswith(suffix))
     columns = read_ply(plain).columns if kind == "spz" else {}  # in the frame of the file
     _settle_frame(tool, converted, plain)
-    if reason := _run(tool, [plain], converted):
+    if reason := run_tool(tool, [plain], converted):
         raise OutputError(f"{path}: {TOOL} does not write it ({reason})")
     if columns:
         refine(converted, columns)
@@ -202,8 +202,8 @@ def answer(command: Sequence[str]) -> str | None:
     return told.stdout + told.stderr if told.returncode == 0 else None
 
 
-def _run(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str:
-    """Run splat-transform. Returns its error message, empty on success."""
+def run_tool(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str:
+    """Run splat-transform on inputs and their options. Returns its error message, empty on success."""
     options = ["--gpu", "cpu", *(["--spz-version", SPZ_VERSION] if is_spz(target) else [])]
     command = [*tool, "--quiet", "--overwrite", *options, *map(str, inputs), str(target)]
     try:

@@ -38,12 +38,13 @@ AWAY = 1.35
 # Training views from whose directions the camera looks.
 VIEWS = (0, 40)
 
-# dB between our picture of each level and the engine's, which SOG's rounding is in; 43, 47 and 52 were measured. Of other levels it is at least so
-# much less.
-ALIKE, APART = (42.0, 45.0, 50.0), 10.0
+# dB between our picture of each level and the engine's; 43, 49 and 55 were measured. What is most of it is the order: of a SOG the engine divides
+# depths into other buckets than of a PLY, as its box ends at the centers. Rounding alone would leave 52 to 54. Of other levels it is at least so much
+# less.
+ALIKE, APART = (42.0, 47.0, 53.0), 10.0
 
-# The same of pictures of a ladder by distance, most of which mix levels: 43 to 54 were measured.
-MIXED = 42.0
+# The same of pictures of a ladder by distance, most of which mix levels: 45 to 57 were measured.
+MIXED = 43.0
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from PIL import Image
 from png_files import GRAY_16, RGB, write_png
 
 from mipmap_plugin.errors import OutputExists, SceneError, ShapeError
-from mipmap_plugin.formats.images import composite, image_size, read_image, write_image
+from mipmap_plugin.formats.images import composite, image_size, read_image, read_rgba, write_image
 
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 
@@ -47,6 +47,14 @@ def test_a_large_jpeg_is_read_smaller_where_few_pixels_do(tmp_path, least, size)
     image = read_image(tmp_path / "a.jpg", WHITE, least)
     assert tuple(image.shape[:2]) == size
     torch.testing.assert_close(image[4, 4] * 255, torch.tensor([200.0, 100.0, 50.0]), atol=2, rtol=0)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA"])
+def test_pixels_are_read_as_they_are_stored(tmp_path, mode):
+    pixels = np.random.default_rng(0).integers(0, 255, (3, 5, len(mode)), np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.webp", lossless=True, exact=True)
+    read = read_rgba(tmp_path / "a.webp")
+    assert np.array_equal(read[..., : len(mode)], pixels) and (mode == "RGBA" or (read[..., 3] == 255).all())
 
 
 def test_16_bit_gray_keeps_its_precision(tmp_path):

@@ -2,7 +2,7 @@
 
 from mipmap_plugin.formats.streamed_sog import Chunk
 
-CHUNKS = [Chunk((0, 0, 0), (2, 1, 1), (30, 0, 1)), Chunk((2, 0, 0), (4, 1, 1), (10, 0, 1))]
+CHUNKS = [Chunk((0, 0, 0), (2, 1, 1), (30, 2, 1)), Chunk((2, 0, 0), (4, 1, 1), (10, 3, 1))]
 
 LADDER = {
     "base_pixel": 0.01,
