@@ -1,16 +1,14 @@
 """One sentence instead of a traceback for everything that is wrong, and the words of the command line."""
 
-import errno
 import inspect
 import os
 import re
 from pathlib import Path
 from typing import get_args
-from unittest.mock import Mock
 
 import pytest
 import tiny
-from commands_run import NO_STEP, QUICK, refused
+from commands_run import refused
 
 from mipmap_plugin.cli import COMMANDS, EXAMPLES
 from mipmap_plugin.commands.types import read_scale, read_viewer
@@ -114,11 +112,6 @@ def test_a_damaged_photograph_ends_in_one_sentence(run, model_folder, tmp_path):
     refused(run("evaluate", model_folder, "--images", scene, "--scale", "1"), "view_0.png")
 
 
-def test_a_damaged_state_ends_in_one_sentence(run, model_folder, tmp_path):
-    (tmp_path / "new.ply.resume").write_bytes(b"PK\x03\x04 not quite")
-    refused(run("adapt", model_folder, "--scale", "1/4", "--output", tmp_path / "new.ply", *QUICK), "not the state of an interrupted run")
-
-
 def test_requests_that_cannot_be_served_end_in_one_sentence(run, model_folder):
     refused(run("adapt", model_folder, "--scale", "4", "--backend", "gpu"), "there is no backend 'gpu'; choose from", "reference")
     refused(run("adapt", model_folder, "--scale", "4", "--upsampler", "swin"), "there is no upsampler 'swin'; choose from bicubic, lanczos")
@@ -126,17 +119,6 @@ def test_requests_that_cannot_be_served_end_in_one_sentence(run, model_folder):
     refused(run("adapt", model_folder), "--scale is required; give --scale 1/4")
     refused(run("evaluate", model_folder, "--images", model_folder), "--scale is required; give --scale 1/4")
     refused(run("adapt", model_folder, "--scale", "4", "--cameras", "nowhere.json"), "nowhere.json: there is no such file")
-
-
-def test_a_full_disk_ends_in_one_sentence_and_leaves_the_old_file(run, tmp_path, monkeypatch):
-    base, output = tiny.ply(tmp_path / "base.ply"), tmp_path / "new.ply"
-    output.write_text("precious")
-    monkeypatch.setattr("mipmap_plugin.formats.atomic.os.replace", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
-    words = ["--output", output, "--overwrite", *NO_STEP]
-    code, out, err = run("adapt", base, "--scale", "4", *words)
-    orbit, said = err.splitlines()
-    assert (code, out) == (2, "") and "generated orbit" in orbit and "new.ply cannot be written: No space left on device" in said
-    assert output.read_text() == "precious" and sorted(path.name for path in tmp_path.iterdir()) == ["base.ply", "new.ply"]
 
 
 @pytest.mark.usefixtures("brief_ladders")
