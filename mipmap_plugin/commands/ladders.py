@@ -116,8 +116,6 @@ def _kept(unfinished: Path) -> Iterator[None]:
 
 def _ends_at_once(wrapped: Wrapped, request: LadderRequest) -> str:
     """The option for which a ladder will have one level, as far as that is known before any work; "" if it will have more."""
-    if wrapped.model.traits.no_viewer:
-        return ""  # and no ladder
     if request.until_splats is not None and len(wrapped.model.parameters()["means"]) <= request.until_splats:
         return "--until-splats"
     band = request.first_band(wrapped)

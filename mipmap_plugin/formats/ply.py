@@ -65,7 +65,7 @@ class Element:
 class Header:
     """The declarations of a PLY, checked against the size of the file."""
 
-    format: str
+    format: str  # a key of BYTE_ORDER
     elements: tuple[Element, ...]
     comments: tuple[str, ...]
     body: int  # bytes from the start of the file to the first row
@@ -89,7 +89,6 @@ class PlyFile:
 
     columns: dict[str, np.ndarray]  # in file order, each [N], in the type and byte order of the file
     comments: tuple[str, ...]  # texts of `comment` and `obj_info` lines
-    format: str  # a key of BYTE_ORDER
     notes: tuple[str, ...] = ()  # what was tolerated, and what is left out, in sentences
 
 
@@ -117,7 +116,7 @@ def read_ply(path: str | Path) -> PlyFile:
     others = [element.name for element in header.elements if element.count and element.name != "vertex"]
     named = ", ".join([*others[:NAMED], *["..."] * (len(others) > NAMED)])
     notes = (f"beside its splats it holds {named}, which are left out of files that are made of it",) if others else ()
-    return PlyFile({name: rows[name] for name in header.vertex.names}, header.comments, header.format, (*header.notes, *notes))
+    return PlyFile({name: rows[name] for name in header.vertex.names}, header.comments, (*header.notes, *notes))
 
 
 def read_element(path: Path, header: Header, element: Element) -> np.ndarray:

@@ -73,7 +73,7 @@ def _make_levels_by_zoom(base: FrozenBase, request: LadderRequest, resume: Path 
         end = max(request.coarsest, lowest)
         levels, switches, unshown = _shown(made, yardstick, end)
         edges = [1.0, *(switch.zoom for switch in switches), end]
-        curve = _curve(levels, edges, yardstick, lambda zoom: yardstick.psnr_of_base(base, request.viewer, zoom))
+        curve = _curve(levels, edges, yardstick, lambda zoom: yardstick.psnr_of_base(request.viewer, zoom))
     left_out = sorted([*unused, *unshown], key=lambda level: -level.scale)
     return Ladder(Contents(request, base, levels, switches, curve, left_out), store, manifest)
 

@@ -28,8 +28,6 @@ def room_for(base: FrozenBase, request: LadderRequest, unfinished: Path) -> int:
 
 def shares(base: FrozenBase, request: LadderRequest) -> list[float]:
     """How many splats each level is planned to have, in those of the base. Merging may keep more, where it would cost too much."""
-    if base.model.traits.no_viewer:
-        return [1.0]  # no ladder is made
     band = request.first_band(base)
     if by_distance(base, request):
         return _by_distance(base, request, band)

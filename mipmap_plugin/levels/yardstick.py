@@ -49,7 +49,7 @@ class Yardstick:
         self.views = [view.window(WINDOW, WINDOW) for view in (shown or views)[:VIEWS]]
         self._images = {view: base.render(view).image.clamp(0, 1) for view in self.views}
         self._of_level = lru_cache(KEPT)(lambda level: _drawing(level.model, level.backend, level.effects))
-        self._of_base = lru_cache(1)(lambda base, viewer: _drawing(base.read_by(viewer), base.backend(viewer=viewer)[0], base.effects(viewer=viewer)))
+        self._of_base = lru_cache(1)(lambda viewer: _drawing(base.read_by(viewer), base.backend(viewer=viewer)[0], base.effects(viewer=viewer)))
 
     def example(self) -> tuple[Camera, Tensor]:
         """One of the views, and the base's own image of it [h, w, 3]."""
@@ -61,9 +61,9 @@ class Yardstick:
         draw = self._of_level(level)
         return self._mean(lambda camera, truth: psnr_as_shown(draw(camera), truth), zoom)
 
-    def psnr_of_base(self, base: FrozenBase, viewer: str, zoom: float) -> float:
+    def psnr_of_base(self, viewer: str, zoom: float) -> float:
         """Mean PSNR (dB) of the base itself, as a viewer draws it at a zoom."""
-        draw = self._of_base(base, viewer)
+        draw = self._of_base(viewer)
         return self._mean(lambda camera, truth: psnr_as_shown(draw(camera), truth), zoom)
 
     def likeness(self, one: Adapted, other: Adapted, zoom: float) -> float:

@@ -43,7 +43,7 @@ def _zoom(ladder: Contents, yardstick: Yardstick, scale: float) -> Zoom:
     camera = view.zoomed(scale)
     truth = shrunk(image, camera).clamp(0, 1)
     base = ladder.base.render(camera, viewer=viewer).image
-    pictures = [_picture(f"base in {viewer}", "base", base, truth, yardstick.psnr_of_base(ladder.base, viewer, scale))]
+    pictures = [_picture(f"base in {viewer}", "base", base, truth, yardstick.psnr_of_base(viewer, scale))]
     for name, role, number in _shown(ladder, scale):
         adapted = ladder.levels[number].adapted
         pictures.append(_picture(name, role, adapted.render(camera).image, truth, yardstick.psnr(adapted, scale), f"level_{number}.ply"))

@@ -3,11 +3,10 @@
 import json
 
 import pytest
-import tiny
 import torch
 from commands_run import refused
 
-from mipmap_plugin import register_backend, registry
+from mipmap_plugin import register_backend
 from mipmap_plugin.backends.conformance import CASES, MORE, Outcome
 from mipmap_plugin.commands.list import GROUPS, KINDS, registry_of
 from mipmap_plugin.errors import SettingsError
@@ -55,15 +54,6 @@ def test_backends_check_goes_case_by_case_and_further_where_asked(full, run, mon
     assert torch.get_num_threads() == 2
     torch.set_num_threads(threads)
     assert asked == [([case], 1) for case in [*CASES, *(MORE if full else [])]]
-
-
-def test_a_broken_plugin_breaks_only_itself(run, tmp_path, monkeypatch):
-    from importlib.metadata import EntryPoint
-
-    points = [EntryPoint("broken", "no_such_package:Backend", "mipmap_plugin.backends")]
-    monkeypatch.setattr(registry, "entry_points", lambda group: [point for point in points if point.group == group])
-    assert "No module named 'no_such_package'" in run("backends")[1]
-    refused(run("adapt", tiny.ply(tmp_path / "a.ply"), "--scale", "4", "--backend", "broken"), "'broken'", "cannot be loaded")
 
 
 def test_list_says_where_names_come_from_and_what_is_wrong_with_one(run, tmp_path, monkeypatch):

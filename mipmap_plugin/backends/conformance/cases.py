@@ -134,15 +134,16 @@ def rows_of_the_crowd(rows: list[int]) -> HardCase:
     return HardCase(crowd()[torch.tensor(rows)], view(), Effects(1))
 
 
-def at_one_depth(n: int = 10_000) -> HardCase:
+def at_one_depth() -> HardCase:
     """Ties in depth: the splat with the lower index is in front."""
-    gaussians = crowd(n)
+    gaussians = crowd(10_000)
     gaussians.means[:, 2] = 3
     return HardCase(replace(gaussians, scales=gaussians.scales / 4), view(), Effects(1))
 
 
-def in_one_pixel(n: int = 10_000) -> HardCase:
+def in_one_pixel() -> HardCase:
     """Tiny opaque splats, one behind the other, all in the same pixel."""
+    n = 10_000
     gaussians = crowd(n)
     camera = view(16, 16)
     depths = 1 + torch.arange(n, dtype=torch.float64) / n

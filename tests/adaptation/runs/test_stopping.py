@@ -78,14 +78,6 @@ def test_ctrl_c_without_a_file_to_resume_from_says_so(ctrl_c):
         wrapped().adapt(1 / 4, **BRIEF)
 
 
-def test_a_second_ctrl_c_is_immediate_and_the_old_handler_comes_back(slowly):
-    before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt), interruptible():
-        signal.raise_signal(signal.SIGINT)
-        signal.raise_signal(signal.SIGINT)
-    assert signal.getsignal(signal.SIGINT) is before
-
-
 @pytest.fixture
 def handled_by():
     """Return a function that sets a program's own handler of Ctrl-C, which is undone after the test."""
