@@ -35,6 +35,10 @@ ROUNDING = torch.finfo(torch.float32).eps
 # Candidates per generated view: keeping those that fill gaps gains 0.5 dB on lego's test views at x1/8.
 CANDIDATES = 16
 
+# Of a capture with one kind of views, those that fill gaps best have 1.1 to 1.7 times the room (`_room`) of the median candidate (23 captures).
+# Where some cameras are far away, or look past the scene, they have 2.3 and 3.3 times: sparse parts would get nearly all views.
+MOST_ROOM = 2.0
+
 # The sine of the angle between two lines of sight below which their intersection counts as undefined.
 PARALLEL = 1e-6
 
@@ -55,7 +59,7 @@ def jittered(
     similar direction, or extrapolated a little (`BEYOND`): centers on an arc around the point that both look at, rotations on an
     arc. Then the center is moved by `amount` of the distance between the two, and the view rotated by `amount` of its field of
     view, one standard deviation each. `spread`: of `CANDIDATES` times as many views, those farthest from the cameras and from each other
-    are kept, which fill gaps; otherwise they are as typical as the cameras. Raises SettingsError without cameras.
+    are kept, which fill gaps (`_spread`); otherwise they are as typical as the cameras. Raises SettingsError without cameras.
     """
     if not cameras or count < 0 or amount < 0:
         raise SettingsError(f"jittered views need cameras, but got {len(cameras)} cameras, count={count} and amount={amount}")
@@ -75,7 +79,7 @@ def jittered(
     moved = _on_arc(centers[pairs], rotations[pairs][..., 2], along) + shift * gap
     far = list(range(count))
     if spread:
-        far = _farthest(_places(moved, turned, times[index], centers), _places(centers, rotations, times, centers), count)
+        far = _spread(_places(moved, turned, times[index], centers), _places(centers, rotations, times, centers), count)
     poses = [(cameras[int(index[i])], viewmat_of(turned[i], moved[i])) for i in far]
     return [replace(camera, viewmat=pose, name=f"jittered_{n:04d}", split="train") for n, (camera, pose) in enumerate(poses)]
 
@@ -171,11 +175,29 @@ def _places(centers: Tensor, rotations: Tensor, times: Tensor, around: Tensor) -
     return torch.cat([(centers - middle) / (size if size > rounding else 1.0), rotations[..., 2], times[:, None]], dim=1)
 
 
-def _farthest(places: Tensor, taken: Tensor, count: int) -> list[int]:
-    """`count` rows of `places` [V, D], each the farthest from those `taken` [T, D] and chosen so far (Gonzalez 1985)."""
+def _spread(places: Tensor, taken: Tensor, count: int) -> list[int]:
+    """`count` rows of `places` [V, D], far from those `taken` [T, D] and from each other.
+
+    Where that leaves hardly any in dense parts, such as close-ups (`MOST_ROOM`), distances are in units of room: views are as dense as places.
+    """
+    chosen = _farthest(places, taken, count, torch.ones_like(places[:, 0]))
+    if not chosen:
+        return chosen
+    room = _room(places).clamp_min(SAME_PLACE)
+    return chosen if room[chosen].median() <= MOST_ROOM * room.median() else _farthest(places, taken, count, room)
+
+
+def _room(places: Tensor) -> Tensor:
+    """The distance of each of `places` [V, D] to the `CANDIDATES`-th nearest of the others, or the farthest of fewer, [V]."""
+    number = min(CANDIDATES + 1, len(places))
+    return torch.cat([torch.cdist(some, places).topk(number, largest=False).values[:, -1] for some in places.split(BLOCK)])
+
+
+def _farthest(places: Tensor, taken: Tensor, count: int, room: Tensor) -> list[int]:
+    """`count` rows of `places` [V, D], each the farthest from those `taken` [T, D] and chosen so far (Gonzalez 1985), in units of its `room` [V]."""
     chosen: list[int] = []
     distance = torch.cat([torch.cdist(some, taken).amin(1) for some in places.split(BLOCK)])
     for _ in range(count):
-        chosen.append(int(distance.argmax()))
+        chosen.append(int((distance / room).argmax()))
         distance = torch.minimum(distance, (places - places[chosen[-1]]).norm(dim=1))
     return chosen
