@@ -159,10 +159,10 @@ def too_unlike(views: Sequence[Camera]) -> str:
     return f"{where}; {EACH_LENS}"
 
 
-def worse_views(views: Sequence[Camera], before: Sequence[float], after: Sequence[float], scale: float) -> list[str]:
+def worse_views(views: Sequence[Camera], before: Sequence[float], after: Sequence[float], scale: float, *, orbit: bool = False) -> list[str]:
     """That the file for `scale` shows some views worse than the base does, while it gains by their mean, in a sentence; none where it loses by that.
 
-    `before`, `after`: dB of each view as far as differences are visible.
+    `before`, `after`: dB of each view as far as differences are visible. `orbit`: the views were generated, some of them finer, and have no lens.
     """
     worse = [then > now + HARM_DB for then, now in zip(before, after, strict=True)]
     if not any(worse) or sum(after) < sum(before):
@@ -171,7 +171,7 @@ def worse_views(views: Sequence[Camera], before: Sequence[float], after: Sequenc
     where = f"in {some_of(sum(worse), len(views), 'view')} that it was chosen by, the file for x{scale:g} looks worse than the base"
     told = f"{where}, by up to {then - now:.1f} dB as far as differences can be seen ({then:.1f} -> {now:.1f}), though it gains by their mean"
     shortest, longer = min(map(_focal, views)), min(map(_focal, compress(views, worse)))
-    if longer >= LONGER * shortest:
+    if longer >= LONGER * shortest and not orbit:
         told += f"; they are seen through longer lenses, of {longer:.0f} px and more, where the shortest has {shortest:.0f} px: {EACH_LENS}"
     return [told]
 
