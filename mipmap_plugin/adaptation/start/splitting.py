@@ -46,10 +46,10 @@ SHORTER, APART = 0.6, 0.9
 def in_parts(problem: StartProblem) -> StartProblem:
     """The same problem with large splats of the base in parts, where the target leaves them out and it looks better by that.
 
-    Not where blend weights cannot be measured, and only as far as a time budget allows.
+    Not without the closed form (`paper`), nor where blend weights cannot be measured, and only as far as a time budget allows.
     """
     cut = _cuts(problem)
-    if cut is None or not problem.has_blend_weights:
+    if cut is None or not (problem.has_blend_weights and problem.config.closed_form):
         return problem
     whole, parts, views = problem.base(), problem.base(), evenly(problem.views, LOOKED_AT)
     splats = whole.gaussians(views[0]).detach()
@@ -65,8 +65,8 @@ def in_parts(problem: StartProblem) -> StartProblem:
 def thirds(splats: Gaussians) -> Gaussians:
     """Three splats for each of N, [3N]: the middle ones, and those at either end of its longest axis.
 
-    Their opacities are such that all three together have nearly the opacity of the splat everywhere: by least squares along the axis, which a line
-    in that opacity fits, within 0.02 of it up to an opacity of 0.4, and 0.05 up to 1.
+    All three together are nearly as opaque as the splat everywhere, within 0.02 up to an opacity of 0.4 and within 0.06 up to 1. Their opacities over
+    its own were found by least squares along the axis, and rise nearly linearly with it.
     """
     longest, axis = splats.scales.max(dim=1)
     along = torch.take_along_dim(rotations(splats.quats), axis[:, None, None], dim=2)[:, :, 0]

@@ -87,9 +87,10 @@ def test_a_splat_beside_the_picture_comes_in_parts_which_the_viewer_draws():
         (splats_at(2.5, 2.0), CLASSIC, {}),  # is left out nowhere
         (splats_at(0.5, 0.3), WEB, {}),  # lies in the pictures
         (splats_at(2.5, 2.0), WEB, {"time_budget_s": 1e-6}),
+        (splats_at(2.5, 2.0), WEB, {"closed_form": False}),
     ],
 )
-def test_nothing_is_split_where_nothing_is_left_out_or_there_is_little_time(splats, target, settings):
+def test_nothing_is_split_where_nothing_is_left_out_or_it_is_not_asked_for(splats, target, settings):
     problem = problem_of(splats, target, **settings)
     assert in_parts(problem) is problem
 
