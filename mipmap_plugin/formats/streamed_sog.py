@@ -94,17 +94,23 @@ def _numbered(columns: Mapping[str, np.ndarray], place: int) -> dict[str, np.nda
 
 def _rewrite(levels: Sequence[Path], cuts: Sequence[Path], tell: Callable[[int, int], None]) -> None:
     """Write the SOGs beside the first of the `cuts` again, from the splats that they hold. Raises OutputError where these are not the levels'."""
-    meta = read_json(cuts[0])
-    done, leaves = 0, list(_leaves(meta["tree"]))
+    meta, done = read_json(cuts[0]), 0
     for number, level in enumerate(levels):
-        columns = read_ply(level).columns
-        files = {leaf["lods"][str(number)]["file"] for leaf in leaves if str(number) in leaf["lods"]}
-        rows = {name: _rows([cut.parent / name for cut in cuts]) for name in (meta["filenames"][file] for file in sorted(files))}
+        columns, rows = read_ply(level).columns, _rows_by_file(meta, number, cuts)
         if not np.array_equal(np.sort(np.concatenate([np.zeros(0, np.int64), *rows.values()])), np.arange(len(columns["x"]))):
             raise OutputError(f"{cuts[0]}: {TOOL} did not write each splat of {level.name} once; run: {INSTALL}@{KNOWN}")
         for name, own in rows.items():
             rewrite_sog(cuts[0].parent / name, {key: column[own] for key, column in columns.items()})
             tell(done := done + 1, len(meta["filenames"]))
+
+
+def _rows_by_file(meta: dict[str, Any], number: int, cuts: Sequence[Path]) -> dict[str, np.ndarray]:
+    """The rows of a level's splats in each of its SOGs, by the names of these; none where a version of splat-transform writes something unknown."""
+    try:
+        files = {leaf["lods"][str(number)]["file"] for leaf in _leaves(meta["tree"]) if str(number) in leaf["lods"]}
+        return {name: _rows([cut.parent / name for cut in cuts]) for name in (meta["filenames"][file] for file in sorted(files))}
+    except (LookupError, TypeError, ValueError, AttributeError):  # other keys, other kinds of files, or not the same splats for each digit
+        return {}
 
 
 def _rows(metas: Sequence[Path]) -> np.ndarray:

@@ -7,6 +7,7 @@ import pytest
 from sog_files import columns_of, matched, read_sog, read_unpacked
 
 from mipmap_plugin.errors import OutputError
+from mipmap_plugin.formats import streamed_sog
 from mipmap_plugin.formats.ply import write_ply
 from mipmap_plugin.formats.sog import write_sog
 from mipmap_plugin.formats.streamed_sog import DIGITS, write_streamed_sog
@@ -49,5 +50,13 @@ def test_splat_transform_gets_no_more_than_it_needs_and_runs_once_for_each_digit
 
 def test_a_version_that_loses_a_splat_is_told_of(tmp_path, tool):
     level = write_ply(tmp_path / "level_0.ply", columns_of(20, 1), ["twice"])
+    with pytest.raises(OutputError, match=r"splat-transform did not write each splat of level_0.ply once; run: npm install -g .*@3.7$"):
+        write_streamed_sog([level], tmp_path / "lod-meta.json", 1)
+
+
+@pytest.mark.parametrize(("key", "other"), [("filenames", "files"), ("tree", "root"), ("sh0", "colors")])
+def test_a_version_that_writes_something_unknown_is_told_of(tmp_path, tool, monkeypatch, key, other):
+    monkeypatch.setattr(streamed_sog, "read_json", lambda file: json.loads(file.read_text().replace(f'"{key}"', f'"{other}"')))
+    level = write_ply(tmp_path / "level_0.ply", columns_of(20, 1))
     with pytest.raises(OutputError, match=r"splat-transform did not write each splat of level_0.ply once; run: npm install -g .*@3.7$"):
         write_streamed_sog([level], tmp_path / "lod-meta.json", 1)

@@ -23,7 +23,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.contract import rebuild
 from mipmap_plugin.splatting.rotations import rotations
 
-# What is left out of so many views, drawn at this fraction of their size, tells.
+# What a viewer leaves out is looked for in so many views, drawn at this fraction of their size.
 LOOKED_AT, SIZE = 24, 0.5
 
 # The part of a picture, on average over the views, that a splat may lose, and all that lose more may lose together.
@@ -35,7 +35,7 @@ ROUNDS = 6
 # There are at most so many times as many splats as before; those that lose most are split first. With 1.25 an object under a sky has no dB more.
 MOST = 1.1
 
-# The part of a start's time, in a time budget, that looking for such splats may take.
+# In a time budget looking for such splats may take so much of a start's time (`START_SHARE`), before that begins.
 PART = 1 / 4
 
 # The three parts of a splat: their longest axis and the distance of the outer ones from the middle, in its standard deviations.

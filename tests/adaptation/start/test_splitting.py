@@ -95,6 +95,28 @@ def test_nothing_is_split_where_nothing_is_left_out_or_it_is_not_asked_for(splat
     assert in_parts(problem) is problem
 
 
+def test_nothing_is_split_where_blend_weights_cannot_be_measured(monkeypatch):
+    problem = problem_of(splats_at(2.5, 2.0))
+    monkeypatch.setattr(splitting, "weighed", None)
+    without = replace(problem, has_blend_weights=False)
+    assert in_parts(without) is without
+    monkeypatch.setattr(problem.backend, "lacking", lambda needs: ["no frame"] if needs.settings.frame < 2 else [], raising=False)
+    assert in_parts(problem) is problem
+
+
+def test_lengths_that_a_viewer_shortens_are_in_pixels_of_its_own_picture():
+    target = replace(CLASSIC, settings=RenderSettings(radius=3.0, max_half_axis=8.0, fits_picture=True))
+    whole, cut = splitting._cuts(replace(problem_of(splats_at(0.0, 2.0), target), scale=1 / 4))
+    assert whole.settings == RenderSettings(radius=3.0) and cut.settings == replace(target.settings, max_half_axis=32.0)
+
+
+def test_what_a_splat_loses_is_told_in_parts_of_a_picture(monkeypatch):
+    """All of its 768 pixels at most, which is more than nothing is worth."""
+    monkeypatch.setattr(splitting, "LEAST_LOST", 1.0)
+    problem = problem_of(splats_at(2.5, 2.0))
+    assert in_parts(problem) is problem
+
+
 def test_a_splat_stays_whole_where_that_looks_no_worse():
     problem = replace(problem_of(splats_at(2.5, 2.0)), quality=lambda _: Quality(30.0, 30.0))
     assert in_parts(problem) is problem

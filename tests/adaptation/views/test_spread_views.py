@@ -5,7 +5,7 @@ import math
 import torch
 
 from mipmap_plugin.camera import Camera, viewmat_of
-from mipmap_plugin.scenes import jittered
+from mipmap_plugin.scenes import jittered, trajectories
 
 
 def looking_in(radius: float, turn: float, count: int) -> list[Camera]:
@@ -31,7 +31,14 @@ def test_close_ups_have_their_share_of_the_views_beside_overviews():
     assert (far < 1.5).float().mean() > 0.2
 
 
-def test_candidates_in_one_place_are_no_division_by_zero():
-    [camera] = looking_in(1.0, 0.0, 1)
-    views = jittered([camera, camera], 20, torch.Generator().manual_seed(0), amount=0.0)
-    assert all(torch.equal(view.viewmat, camera.viewmat) for view in views) and len(views) == 20
+def test_views_of_a_capture_with_one_kind_of_views_fill_gaps_wherever_these_are(monkeypatch):
+    found = distances(looking_in(4.0, 0.0, 30))
+    monkeypatch.setattr(trajectories, "MOST_ROOM", math.inf)
+    assert torch.equal(found, distances(looking_in(4.0, 0.0, 30)))
+
+
+def test_candidates_in_one_place_do_not_take_all_views():
+    """They have no room, by which nothing can be divided."""
+    [near], far = looking_in(1.0, 0.0, 1), looking_in(8.0, 0.1, 10)
+    found = jittered([near] * 40 + far, 20, torch.Generator().manual_seed(0), amount=0.0)
+    assert sum(torch.allclose(view.viewmat, near.viewmat) for view in found) < 2
