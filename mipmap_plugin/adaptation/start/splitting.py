@@ -90,7 +90,9 @@ def _cuts(problem: StartProblem) -> tuple[Effects, Effects] | None:
 
 def _split(splats: Gaussians, views: Sequence[Camera], problem: StartProblem, cut: tuple[Effects, Effects]) -> Gaussians:
     """The splats, those that lose much in parts."""
-    most = int(MOST * len(splats))
+    most, allowed = int(MOST * len(splats)), problem.config.most_splats
+    if allowed is not None and len(splats) <= allowed:  # or they are merged after all
+        most = min(most, allowed)
     picture = sum(view.width * view.height for view in views) / len(views)
     clock = start_clock(problem)
     if clock.limited:

@@ -128,6 +128,10 @@ def test_there_are_at_most_so_many_parts(monkeypatch):
     assert count_of(in_parts(problem_of(splats_at(2.5, 2.0)))) <= 1.05 * 51
 
 
+def test_as_many_splats_as_are_allowed_are_not_exceeded():
+    assert count_of(in_parts(problem_of(splats_at(2.5, 2.0), most_splats=53))) == 53
+
+
 def test_a_file_for_a_viewer_begins_with_what_it_would_leave_out_in_parts():
     model = VanillaModel.from_gaussians(splats_at(2.5, 2.0), TrainedScale())
     adapted = wrap_model(model, cameras=VIEWS, backend="reference").adapt(1, viewer="cesium", steps=0, closed_form=True, merge_to=1.0)
