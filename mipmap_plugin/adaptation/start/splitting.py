@@ -1,7 +1,7 @@
 """Splits the large splats that a viewer leaves out of pictures in which training drew them.
 
 Viewers leave out a splat whose center lies too far beside the picture (`RenderSettings.frame`), and shorten one that is longer than `max_half_axis`.
-In a capture a few dozen splats, of its lawn or sky, lose most by that: 50 of 38,347 in flowers, which have 20 dB in Spark as they are, and 27 with
+In a capture a few dozen splats, of its lawn or sky, lose most by that: 50 of 38,347 in flowers, which have 20 dB in Spark as they are, and 26 with
 these in parts. A splat is replaced by three along its longest axis until the viewer leaves out hardly anything.
 """
 
