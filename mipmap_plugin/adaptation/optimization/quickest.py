@@ -9,7 +9,8 @@ from contextlib import contextmanager
 from mipmap_plugin.adaptation.optimization.costs import Costs
 from mipmap_plugin.process import threads
 
-# Steps of a trial with each number of threads; the shortest counts, because others are longer by chance.
+# Steps of a trial with each number of threads; the shortest counts, because others are longer by chance. One step with one thread is enough if it
+# takes longer than all of those with all threads: on many cores it takes as long as many of them.
 TRIED = 3
 
 # Steps from one trial to the next: twice as many each time that it ends as the one before, for all threads are mostly better or mostly worse.
@@ -46,6 +47,8 @@ class QuickestThreads:
         if self._step < 2 * TRIED:
             self._times[count].append(seconds)
         self._step += 1
+        if TRIED < self._step < 2 * TRIED and seconds > max(self._times[self._most]):
+            self._step = 2 * TRIED
         if self._step == 2 * TRIED:
             best = min(self._times, key=lambda tried: min(self._times[tried]))
             self._interval = min(2 * self._interval, LONGEST_INTERVAL) if best == self._best else FIRST_INTERVAL
