@@ -67,9 +67,11 @@ def tile_lists(views: Sequence[Projected], team: Team) -> list[Lists]:
     """Each tile's splats and their slots, of each view, not yet sorted by depth."""
     count = len(views[0].order)
     runs = 1 if team.threads == 1 else max(team.threads, min(RUNS_PER_THREAD * team.threads, count // threads.LEAST_ROWS))
+    slots_before = np.zeros((len(views), runs + 1), np.int64)  # before each run, and of all
+    team.share_all(count_slots, [(runs, (view.counts, befores[1:])) for view, befores in zip(views, slots_before, strict=True)])
+    slots_before.cumsum(1, out=slots_before)
     written, jobs = [], []
-    for view in views:
-        befores = slots_before(view.counts, runs)
+    for view, befores in zip(views, slots_before, strict=True):
         pairs, (tiles_x, tiles_y) = int(befores[-1]), binning.tile_grid(view.size[1], view.size[0])
         firsts, splats, tiles = empty(count + 1, dtype=np.int64), empty(pairs, dtype=np.int32), empty(pairs, dtype=np.int32)
         written.append((firsts, splats, tiles, np.empty((runs, tiles_x * tiles_y), np.int64)))
@@ -91,15 +93,14 @@ def run_bounds(count, run, runs):
 
 
 @kernel
-def slots_before(counts, runs):
-    """The number of slots before each run, [runs + 1], the last of which is that of all."""
-    befores = np.zeros(runs + 1, np.int64)
-    for run in range(runs):
-        first, last = run_bounds(len(counts), run, runs)
-        befores[run + 1] = befores[run]
+def count_slots(start, stop, counts, slots):
+    """The number of slots of each of the runs start..stop."""
+    for run in range(start, stop):
+        first, last = run_bounds(len(counts), run, len(slots))
+        total = np.int64(0)
         for i in range(first, last):
-            befores[run + 1] += counts[i]
-    return befores
+            total += counts[i]
+        slots[run] = total
 
 
 @kernel
