@@ -184,9 +184,9 @@ def _focal(view: Camera) -> float:
 def too_near(views: Sequence[Camera], means: Tensor, near: float) -> str:
     """How many of the splats with these `means` [N, 3] in a view's picture are not drawn because they are too near, in a sentence; "" if few.
 
-    `near`: the near plane, in world units.
+    Of many splats some are looked at. `near`: the near plane, in world units.
     """
-    some = evenly(views, LOOKED_AT)
+    some, means = evenly(views, LOOKED_AT), means[:: 1 + len(means) // SAMPLES[-1]]
     counts = [torch.cat([inside.sum(1) for inside in _inside(some, means, plane)]).tolist() for plane in (0.0, near)]
     lost = [1 - drawn / count for count, drawn in zip(*counts, strict=True) if count]
     if not lost or fmean(lost) <= TOO_MANY:
