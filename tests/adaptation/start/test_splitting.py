@@ -117,6 +117,15 @@ def test_what_a_splat_loses_is_told_in_parts_of_a_picture(monkeypatch):
     assert in_parts(problem) is problem
 
 
+@pytest.mark.parametrize(("opacity", "splits"), [(0.03, True), (0.02, False)])
+def test_what_hardly_shows_stays_whole(opacity, splits):
+    """Of 4 and 2.4 thousandths of a picture, the first is more than ENOUGH."""
+    whole = splats_at(2.5, 2.0)
+    whole.opacities[0] = opacity
+    problem = problem_of(whole)
+    assert (in_parts(problem) is not problem) == splits
+
+
 def test_a_splat_stays_whole_where_that_looks_no_worse():
     problem = replace(problem_of(splats_at(2.5, 2.0)), quality=lambda _: Quality(30.0, 30.0))
     assert in_parts(problem) is problem
