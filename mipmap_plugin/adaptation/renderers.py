@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -88,7 +87,7 @@ class SteppingRenderer:
             compared = compare(range(len(shots)), [drawn.image for drawn in stepper.render_all(shots)])
             stepper.differentiate_all([gradient for gradient, _ in compared])
             return [square_error for _, square_error in compared]
-        at_once = math.gcd(len(shots), threads.for_views())
+        at_once = min(len(shots), threads.for_views())
         if at_once > 1 and hasattr(stepper, "prepare"):  # one thread would only lose from its cache what it needs next
             stepper.prepare(shots)
         return list(side_by_side(lambda number: self.differentiate_one(stepper, number, shots[number], compare), range(len(shots)), at_once))

@@ -145,7 +145,7 @@ def test_views_of_a_step_may_be_differentiated_in_any_order_and_thread():
     assert all(torch.equal(one, other) for one, other in zip(*(model.parameters().values() for model in models), strict=True))
 
 
-@pytest.mark.parametrize(("count", "calls"), [(1, [1, 1, 1]), (3, [3])])
+@pytest.mark.parametrize(("count", "calls"), [(1, [1, 1, 1]), (2, [3]), (3, [3])])
 def test_threads_project_all_views_of_a_step_together(count, calls, monkeypatch):
     """By rows, whose thread moves them too."""
     from mipmap_plugin.backends.cpu_kernels import drawing
