@@ -187,7 +187,7 @@ def main(
 
     Args:
         data: The folder with checkpoints/.
-        cores: 2, 4, 8 and 16 by default.
+        cores: 2, 4, 6, 8 and 16 by default.
         splats: Only flowers, its splats split into so many.
         output: Where the results go.
     """
@@ -199,7 +199,7 @@ def main(
         ]
         for scene, path, scales in scenes:
             wrap_model(path).adapt(1 / 4, steps=8)  # so that all kernels are compiled
-            rows += [row for scale in scales for row in counted(scene, path, scale, cores or (2, 4, 8, 16))]
+            rows += [row for scale in scales for row in counted(scene, path, scale, cores or (2, 4, 6, 8, 16))]
     write_table(output, "cores", INTRO, HEAD, rows, lambda row: (row.scene, row.splats, row.scale, row.cores))
 
 
