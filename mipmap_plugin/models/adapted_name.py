@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from mipmap_plugin.errors import MipmapPluginError
@@ -11,7 +12,7 @@ from mipmap_plugin.formats.splat_transform import EXCHANGE, READ_ONLY, WRITTEN
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.families import BUILT_IN, find_family
 from mipmap_plugin.models.family import Files
-from mipmap_plugin.models.places import around
+from mipmap_plugin.models.places import GSPLAT, SPLATFACTO, around
 from mipmap_plugin.models.zipped_folder import unzipped
 
 GLTF = (".glb", ".gltf")
@@ -39,10 +40,14 @@ def adapted_name(checkpoint: Path, scale: float, viewer: str | None = None) -> s
 
 
 def model_of(checkpoint: Path) -> Path | None:
-    """The model folder that a folder `point_cloud/iteration_<N>` belongs to; None for any other path. 3DGS does not find its newest iteration where
-    `point_cloud` holds anything else, so what is adapted from one does not lie there."""
-    model, iteration = around(absolute(checkpoint) / "point_cloud.ply") if checkpoint.is_dir() else (None, None)
-    return None if iteration is None else model
+    """The model folder of one iteration: of a folder `point_cloud/iteration_<N>`, or the file of a step of gsplat or nerfstudio; None for any other
+    path. 3DGS and nerfstudio do not find the newest where anything else lies in there, so what is adapted from one does not."""
+    place = absolute(checkpoint)
+    if checkpoint.is_dir():
+        model, iteration = around(place / "point_cloud.ply")
+        return None if iteration is None else model
+    is_step = any(place.parent.name == folder and re.fullmatch(pattern, place.name) for folder, pattern in (GSPLAT, SPLATFACTO))
+    return place.parent.parent if is_step else None
 
 
 def _is_plain(checkpoint: Path) -> bool:
