@@ -11,15 +11,15 @@ from pathlib import Path
 import tyro
 
 from mipmap_plugin import MipmapPluginError, wrap_model
+from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.types import Scale
 from mipmap_plugin.formats.images import write_image
-from mipmap_plugin.models.adapted_name import adapted_name
 
 
 def main(path: tyro.conf.Positional[Path], scale: tyro.conf.Positional[Scale]) -> None:
     model = wrap_model(path)
     adapted = model.adapt(scale)
-    print(adapted.save(path.with_name(adapted_name(path, scale))))
+    print(adapted.save(adapted_path(path, None, scale, several=False)))
 
     camera = model.views()[0].zoomed(scale)
     write_image("before.png", model.render(camera, scale).image, overwrite=True)

@@ -7,7 +7,18 @@ A package registers it without any call, by an entry point in its pyproject.toml
     [project.entry-points."mipmap_plugin.models"]
     npz = "my_package.npz:FAMILY"
 
-and tests it with mipmap_plugin.models.conformance.ModelSuite, as its backends with BackendSuite.
+and tests it in one file, test_npz.py, where everything that a family has to do becomes a pytest test:
+
+    import pytest
+
+    from mipmap_plugin.models.conformance import ModelSuite
+
+    class TestNpz(ModelSuite):
+        family = "npz"
+
+        @pytest.fixture
+        def checkpoint(self, tmp_path):
+            return write_a_small_one(tmp_path / "scene.npz")
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from mipmap_plugin.commands.levels import levels
 from mipmap_plugin.commands.list import list_
 from mipmap_plugin.commands.render import render
 from mipmap_plugin.commands.tradeoff import tradeoff
-from mipmap_plugin.commands.types import RULES, refuse_repeated
+from mipmap_plugin.commands.types import RULES, refuse_repeated, refuse_stray_scales
 from mipmap_plugin.commands.view import view
 from mipmap_plugin.errors import MipmapPluginError, SettingsError, hide_others_warnings, of_a_file, unknown
 from mipmap_plugin.formats.here import told_from_here
@@ -95,6 +95,7 @@ def _parse(words: Sequence[str]) -> None:
         raise SettingsError(f"{dashed}: options begin with two dashes (but for -h); a path that begins with a dash is given as ./{dashed}")
     if words and (command := COMMANDS.get(words[0])):
         refuse_repeated(command, words)
+        refuse_stray_scales(command, words[1:])
         prog, summary = f"mipmap-plugin {words[0]}", (getdoc(command) or "").partition("\n\nArgs:")[0]
         described = f"{summary}\n\nExample: {prog} {EXAMPLES[words[0]]}"
         tyro.cli(_alone(command), prog=prog, description=described, args=words[1:], config=OPTIONS, registry=RULES)

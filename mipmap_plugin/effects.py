@@ -191,7 +191,8 @@ def _view_dependent_color(degree: int, gaussians: Gaussians, base_degree: int) -
     held, bands = gaussians.sh_degree, (degree + 1) ** 2
     available = max(bands, gaussians.sh.shape[1])
     more = f"SH up to degree {degree}, of the base up to {base_degree}: merging has made room for more"
-    reason = more if degree > base_degree else f"SH up to degree {degree} of {held}: above it every coefficient is 0"
+    above = ": above it every coefficient is 0" if degree < held else ""
+    reason = more if degree > base_degree else f"SH up to degree {degree} of {held}{above}"
     count = bands if degree > 0 else available - 1
     return Effect("view-dependent color", degree > 0, reason, f"a direction and {count} of {available} coefficients per splat")
 

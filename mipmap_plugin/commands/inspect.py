@@ -49,7 +49,8 @@ def inspect(
 
         model = load_model(checkpoint, iteration=iteration)
         wrapped = wrap_model(model, cameras=cameras, screen_filter=screen_filter, up=up)
-    facts = _facts(checkpoint, wrapped, cameras, whole=all or json)
+    inspected = checkpoint if iteration is None or not checkpoint.is_dir() else _of_iteration(found.path)
+    facts = _facts(inspected, wrapped, cameras, whole=all or json)
     asked = [note for note in model.notes if "--screen-filter" in note and screen_filter]  # which is answered
     if not json:
         print_facts(facts)  # before pictures are drawn, which takes longer
@@ -57,6 +58,13 @@ def inspect(
         differences = _differences(wrapped) if viewers else "not requested"
     last = {"viewers": differences, "notes": [note for note in model.notes if note not in [*facts["health"], *asked]]}
     print_json(known | facts | last) if json else print_facts(last)
+
+
+def _of_iteration(splats: Path) -> Path:
+    """What `adapt`, which takes the newest iteration of a model folder, is given for that of the file `splats`: its folder, or itself."""
+    from mipmap_plugin.models.adapted_name import model_of
+
+    return splats.parent if model_of(splats.parent) else splats
 
 
 def _differences(wrapped: Wrapped) -> str:

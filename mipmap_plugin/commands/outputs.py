@@ -20,13 +20,13 @@ REPLACED = str.maketrans(dict.fromkeys('/\\:*?"<>|', "_"))
 
 
 def adapted_path(checkpoint: Path, output: Path | None, scale: float, viewer: str | None = None, *, several: bool) -> Path:
-    """The path of an adapted model: beside the checkpoint as NAME_x0.25 or NAME_x0.25_spark (`adapted_name`), or `output`; a folder for all if
-    `several`. Raises SettingsError for a folder with the name of a file."""
-    from mipmap_plugin.models.adapted_name import adapted_name
+    """The path of an adapted model: beside the checkpoint, of an iteration beside its model folder, as NAME_x0.25 or NAME_x0.25_spark
+    (`adapted_name`), or `output`; a folder for all if `several`. Raises SettingsError for a folder with the name of a file."""
+    from mipmap_plugin.models.adapted_name import adapted_name, model_of
 
     name = adapted_name(checkpoint, scale, viewer)
     if output is None:
-        return absolute(checkpoint).parent / name
+        return (model_of(checkpoint) or absolute(checkpoint)).parent / name
     return folder_of_several(output, (".ply", *WRITTEN)) / name if several else output
 
 

@@ -1,10 +1,11 @@
-"""The types of the command line's options, and which of them may be given once only."""
+"""The types of the command line's options, which of them may be given once only, and values that are none of theirs."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
 from fractions import Fraction
+from inspect import signature
 from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
@@ -142,3 +143,25 @@ def refuse_repeated(command: Callable[..., Any], words: Sequence[str]) -> None:
         if options.count(option) > 1 and not is_switch and tyro.conf.UseAppendAction not in getattr(hint, "__metadata__", ()):
             how = ", with all its values behind it" if get_origin(hint) is tuple else ""
             raise SettingsError(f"{option} is given {options.count(option)} times, of which only the last would count; give it once{how}")
+
+
+def refuse_stray_scales(command: Callable[..., Any], words: Sequence[str]) -> None:
+    """Raise SettingsError for a scale that would be taken for a path, or for nothing: the second one behind --scale, or one without --scale."""
+    option, values = "", 0
+    for word in words[: words.index("--")] if "--" in words else words:
+        if word.startswith("--"):
+            option, equals, _ = word.partition("=")
+            values = len(equals)
+            continue
+        values += 1
+        stray = values > 1 if option == "--scale" else "/" in word and (values > 1 or not option)
+        if stray and _is_scale(word) and not Path(word).exists() and "scale" in signature(command).parameters:
+            raise SettingsError(f"{word}: each scale is given by an option of its own, as in --scale 1/2 --scale 1/4")
+
+
+def _is_scale(word: str) -> bool:
+    """Whether a word is a scale."""
+    try:
+        return read_scale(word) > 0
+    except ValueError:
+        return False

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from mipmap_plugin.errors import MipmapPluginError
-from mipmap_plugin.formats.atomic import named
+from mipmap_plugin.formats.atomic import absolute, named
 from mipmap_plugin.formats.readers import READ_GLB
 from mipmap_plugin.formats.splat_transform import EXCHANGE, READ_ONLY, WRITTEN
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.families import BUILT_IN, find_family
 from mipmap_plugin.models.family import Files
+from mipmap_plugin.models.places import GSPLAT, SPLATFACTO, around
 from mipmap_plugin.models.zipped_folder import unzipped
 
 GLTF = (".glb", ".gltf")
@@ -22,7 +24,8 @@ OWN_VIEWERS = ("gsplat", "gsplat-antialiased", "nerfstudio", "nerfstudio-antiali
 
 
 def adapted_name(checkpoint: Path, scale: float, viewer: str | None = None) -> str:
-    """NAME_x0.25 or NAME_x0.25_spark, with the ending of what is saved; none for a folder. NAME is that of a link, not of what it leads to.
+    """NAME_x0.25 or NAME_x0.25_spark, with the ending of what is saved; none for a folder. NAME is that of a link, not of what it leads to, and
+    MODEL_iteration_7000 of one iteration of a model folder.
 
     The ending is that of the file, but for these:
     - an exchange format that is only read, or has another ending, and a PLY in a zip archive: .ply;
@@ -30,9 +33,21 @@ def adapted_name(checkpoint: Path, scale: float, viewer: str | None = None) -> s
     - a third-party family: the one that it names (`Family.saves`), or .ply for any viewer;
     - what gsplat and nerfstudio save: none, as it becomes a folder of theirs, or .ply for a viewer of others.
     """
-    name = named(checkpoint).name
+    model = model_of(checkpoint)
+    name = f"{model.name}_{named(checkpoint).name}" if model else named(checkpoint).name
     read, written = _endings(checkpoint, name, viewer)
     return f"{name[: len(name) - len(read)]}_x{scale:g}{f'_{viewer}' if viewer else ''}{written}"
+
+
+def model_of(checkpoint: Path) -> Path | None:
+    """The model folder of one iteration: of a folder `point_cloud/iteration_<N>`, or the file of a step of gsplat or nerfstudio; None for any other
+    path. 3DGS and nerfstudio do not find the newest where anything else lies in there, so what is adapted from one does not."""
+    place = absolute(checkpoint)
+    if checkpoint.is_dir():
+        model, iteration = around(place / "point_cloud.ply")
+        return None if iteration is None else model
+    is_step = any(place.parent.name == folder and re.fullmatch(pattern, place.name) for folder, pattern in (GSPLAT, SPLATFACTO))
+    return place.parent.parent if is_step else None
 
 
 def _is_plain(checkpoint: Path) -> bool:

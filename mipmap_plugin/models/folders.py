@@ -85,8 +85,8 @@ def model_folders_below(folder: Path) -> list[Path]:
 
 
 def _was_adapted(folder: Path) -> bool:
-    """Whether a model folder has the report of an adaptation beside its checkpoint."""
-    return any(any(folder.glob(f"{place}/*{REPORT}")) for place in ("*", "point_cloud/*"))
+    """Whether a model folder has the report of an adaptation beside its checkpoint. One that lies beside a file adapted from it does not count."""
+    return any(any(folder.glob(f"{splats}{REPORT}")) for splats in ("*/*.pt", "*/*.ckpt", "point_cloud/*/point_cloud.ply"))
 
 
 def is_model_folder(folder: Path) -> bool:

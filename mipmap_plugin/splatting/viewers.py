@@ -170,7 +170,11 @@ ALIASES = {
 
 # What is asked for, but has no record: why, and what to take instead.
 SECRET = "its source is not public, so that how it draws is not known; take portable, which suits many viewers"
-NO_RECORD = dict.fromkeys(("luma", "polycam", "postshot", "scaniverse"), SECRET)
+NO_RECORD = {
+    **dict.fromkeys(("luma", "polycam", "postshot", "scaniverse"), SECRET),
+    "blender": "add-ons draw splats in it, of which KIRI's 3DGS Render is known; take kiri",
+    "unreal": "its plug-ins blend and map tones as the engine does, which is not simulated; take portable, which suits many viewers",
+}
 
 VIEWERS = Registry("mipmap_plugin.viewers", {})
 

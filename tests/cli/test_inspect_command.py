@@ -171,5 +171,6 @@ def test_inspect_says_what_it_knows_before_it_draws(run, model_folder, monkeypat
 
 
 def test_inspect_of_an_iteration(run, model_folder):
-    assert run("inspect", model_folder, "--iteration", "30000")[0] == 0
+    code, out, _ = run("inspect", model_folder, "--iteration", "30000", "--no-viewers")
+    assert code == 0 and f"next: mipmap-plugin adapt {model_folder}/point_cloud/iteration_30000 --scale 1/4" in out
     refused(run("inspect", model_folder, "--iteration", "7"), "7")

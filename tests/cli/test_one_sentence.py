@@ -212,6 +212,28 @@ def test_scales_are_fractions_or_numbers(text, scale):
     assert read_scale(text) == scale
 
 
+@pytest.mark.parametrize(
+    "words", ["a.ply --scale 1/2 1/8", "--scale 1/2 1/8 a.ply", "a.ply --scale=.5 1/8", "a.ply 1/8", "--steps 1 1/8 a.ply"]
+)
+def test_a_scale_without_an_option_of_its_own_is_no_checkpoint(run, words):
+    refused(run("adapt", *words.split()), "1/8: each scale is given by an option of its own, as in --scale 1/2 --scale 1/4")
+
+
+def test_further_decimal_scales_are_told_from_other_numbers(run, tmp_path, monkeypatch):
+    refused(run("tradeoff", "a.ply", "--scale", "0.5", "0.25", "--output", "o"), "0.25: each scale is given by")
+    monkeypatch.chdir(tmp_path)
+    refused(run("inspect", "1/8"), "1/8 does not exist")
+    assert "each scale" not in run("tradeoff", "a.ply", "--scale", "0.5", "--steps", "5", "8", "--output", "o")[2]
+    Path("1").mkdir()
+    tiny.ply(Path("1/8"))
+    assert "each scale" not in run("adapt", "1/8", "--shard", "3/2", "--scale", "1/2")[2]
+
+
+@pytest.mark.parametrize(("name", "told"), [("Blender", "take kiri"), ("unreal", "take portable"), ("luma", "take portable")])
+def test_programs_without_a_record_are_told_of_with_what_to_take(run, name, told):
+    refused(run("adapt", "a.ply", "--scale", "1/4", "--viewer", name), f"viewer {name.lower()}: ", told)
+
+
 @pytest.mark.parametrize("text", ["", "x", "0", "-1/4", "1/0", "inf", "nan", "1e999", "1e308", "1e5", "1e-50", "25%", "1:4", "0,25", "1 4", "×"])
 def test_scales_that_are_no_zoom(text):
     with pytest.raises(ValueError, match=r"scale must be a number or a fraction from 1e-09 to 10000, such as 1/4, 0\.25 or 4, got "):

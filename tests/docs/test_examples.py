@@ -88,13 +88,21 @@ def test_a_file_for_the_viewer_of_the_example(scene, tmp_path, capsys):
     assert b'"viewer": "kiosk"' in (tmp_path / "out.ply").read_bytes()[:8192]
 
 
-@pytest.mark.parametrize(("name", "made"), [("base/", "base_x0.5/point_cloud/iteration_30000/point_cloud.ply"), ("base.ply", "base_x0.5.ply")])
-def test_the_adapted_checkpoint_lies_beside_its_base(tmp_path, monkeypatch, name, made):
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.parametrize(
+    ("name", "place", "given", "made"),
+    [
+        ("base", ".", "base/", "base_x0.5/point_cloud/iteration_30000/point_cloud.ply"),
+        ("base", "base", ".", "base_x0.5/point_cloud/iteration_30000/point_cloud.ply"),
+        ("base", ".", "base/point_cloud/iteration_30000", "base_iteration_30000_x0.5/point_cloud/iteration_30000/point_cloud.ply"),
+        ("base.ply", ".", "base.ply", "base_x0.5.ply"),
+    ],
+)
+def test_the_adapted_checkpoint_lies_beside_its_base(tmp_path, monkeypatch, name, place, given, made):
     tiny.model().save(tmp_path / name, provenance={})
+    monkeypatch.chdir(tmp_path / place)
     monkeypatch.setattr(Wrapped, "adapt", partialmethod(Wrapped.adapt, steps=1))
-    runpy.run_path(str(EXAMPLES / "adapt_checkpoint.py"))["main"](Path(name), 0.5)
-    assert (tmp_path / made).is_file() and (tmp_path / "after.png").is_file()
+    runpy.run_path(str(EXAMPLES / "adapt_checkpoint.py"))["main"](Path(given), 0.5)
+    assert (tmp_path / made).is_file() and Path("after.png").is_file()
 
 
 def test_the_demo_scene_can_be_trained(tmp_path):

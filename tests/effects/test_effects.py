@@ -34,6 +34,7 @@ def test_a_plain_scene_calls_for_the_screen_filter_only():
     told = states(Effects(sh_degree=0), with_bands(0, 3))
     assert {name: reason for name, (on, reason) in told.items() if on} == {"screen filter": "classic, 0.3 px²"}
     assert told["view-dependent color"][1] == "SH up to degree 0 of 3: above it every coefficient is 0"
+    assert states(Effects(sh_degree=3), with_bands(3, 3))["view-dependent color"][1] == "SH up to degree 3 of 3"
 
 
 def test_everything_on():

@@ -2,8 +2,11 @@
 
 import pytest
 import tiny
+from ply_files import write_model_folder
+from torch_checkpoints import gsplat_folder, splatfacto_folder, splats
 
 from mipmap_plugin.cli import main
+from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.pages import evaluation_page_path
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.adapted_name import adapted_name
@@ -37,3 +40,28 @@ def test_a_folder_that_is_given_from_within_has_its_own_name(tmp_path, monkeypat
     folder = tiny.folder(tmp_path / "bicycle")
     monkeypatch.chdir(folder)
     assert adapted_name(type(folder)(given), 1 / 4) == "bicycle_x0.25"
+
+
+def test_what_is_adapted_from_an_iteration_lies_beside_the_model_folder_where_3dgs_looks_for_none(tmp_path, monkeypatch):
+    folder = write_model_folder(tmp_path / "bicycle", 7000)
+    given = folder / "point_cloud/iteration_7000"
+    assert adapted_path(given, None, 1 / 4, several=False) == tmp_path / "bicycle_iteration_7000_x0.25"
+    assert adapted_path(given, tmp_path / "all", 1 / 4, several=True) == tmp_path / "all/bicycle_iteration_7000_x0.25"
+    monkeypatch.chdir(given)
+    assert adapted_path(type(folder)("."), None, 1 / 4, "spark", several=False) == tmp_path / "bicycle_iteration_7000_x0.25_spark"
+    (tmp_path / "iteration_7000").mkdir()
+    assert adapted_path(tmp_path / "iteration_7000", None, 1 / 4, several=False) == tmp_path / "iteration_7000_x0.25"
+
+
+@pytest.mark.parametrize(
+    ("make", "step", "name", "for_spark"),
+    [
+        (splatfacto_folder, "nerfstudio_models/step-000029999.ckpt", "run_step-000029999.ckpt_x0.25", "run_step-000029999_x0.25_spark.ply"),
+        (gsplat_folder, "ckpts/ckpt_6999_rank0.pt", "run_ckpt_6999_rank0.pt_x0.25", "run_ckpt_6999_rank0_x0.25_spark.ply"),
+    ],
+)
+def test_what_is_adapted_from_one_step_lies_beside_the_run_where_nerfstudio_looks_for_none(tmp_path, make, step, name, for_spark):
+    make(tmp_path / "run", splats())
+    assert (tmp_path / "run" / step).is_file()
+    assert adapted_path(tmp_path / "run" / step, None, 1 / 4, several=False) == tmp_path / name
+    assert adapted_path(tmp_path / "run" / step, None, 1 / 4, "spark", several=False) == tmp_path / for_spark

@@ -2,6 +2,7 @@
 
 import json
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import torch
 from oracle import brute_force
 from torch_checkpoints import Hostile, activated, aim, equal, gsplat_folder, normalized_by_numpy, splatfacto_folder, splats
 
-from mipmap_plugin.errors import CheckpointError, SceneError
+from mipmap_plugin.errors import CheckpointError, MipmapPluginWarning, SceneError
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.formats.yaml_scalars import read_scalars
@@ -18,6 +19,7 @@ from mipmap_plugin.models import load_model
 from mipmap_plugin.models.adapted_name import adapted_name
 from mipmap_plugin.models.adapted_scale import adapted_scale, adapted_viewer
 from mipmap_plugin.models.hosts import Capture
+from mipmap_plugin.models.live import adopt
 from mipmap_plugin.wrap import wrap_model
 
 NAMES = ["means", "scales", "quats", "opacities", "sh0", "shN"]
@@ -216,6 +218,19 @@ def test_the_normalized_world_is_found_again_whatever_half_turn_was_taken(tmp_pa
         model.as_trained(cameras, Capture(torch.tensor(points) @ torch.diag(torch.tensor([1.0, 9.0, 1.0])).double()))
     with pytest.raises(SceneError, match=r"give the COLMAP scene .* has to say normalize_world_space: false"):
         model.as_trained(cameras, Capture())
+
+
+def test_without_its_options_the_cameras_keep_their_size_with_a_warning(tmp_path):
+    rng = np.random.default_rng(0)
+    points, cameras = torch.tensor(rng.normal(size=(500, 3)) @ np.diag([3.0, 1.0, 2.0])), tiny.cameras(5, width=128, height=96)
+    folder = gsplat_folder(tmp_path / "r", splats(500))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert load_model(folder).as_trained(cameras, Capture(points))[0].size == (24, 32)
+    (folder / "cfg.yml").unlink()
+    for model in (load_model(folder), adopt(splats(500))):
+        with pytest.warns(MipmapPluginWarning, match="x1 is taken to be the size of the cameras, but gsplat's trainer shrinks"):
+            assert model.as_trained(cameras, Capture(points))[0].size == (96, 128)
 
 
 def test_a_world_that_was_not_normalized_is_the_scenes_own(tmp_path):

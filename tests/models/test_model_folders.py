@@ -48,6 +48,9 @@ def test_a_folder_above_its_checkpoints_names_them(tmp_path):
     cloud.with_name(f"{cloud.name}.adaptation.json").write_text("{}")
     with pytest.raises(CheckpointError, match=r"scenes lies above its checkpoint; give .*garden$"):
         detect(tmp_path / "scenes")
+    (tmp_path / "scenes/garden/point_cloud/iteration_7000/point_cloud_x0.25.ply.adaptation.json").write_text("{}")
+    with pytest.raises(CheckpointError, match=r"scenes lies above its checkpoint; give .*garden$"):
+        detect(tmp_path / "scenes")
 
 
 def test_folders_without_an_answer(tmp_path):

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import CheckpointError, SceneError, ShapeError
+from mipmap_plugin.errors import CheckpointError, SceneError, ShapeError, warn
 from mipmap_plugin.formats.atomic import new_folder, sha256
 from mipmap_plugin.formats.tags import render_mode
 from mipmap_plugin.formats.torch_file import load_torch, save_torch, step_and_comments
@@ -40,6 +40,11 @@ UP = (0.0, 0.0, 1.0)
 UNKNOWN = (
     "cfg.yml is not beside the checkpoint, so that it is taken to be trained with the classic screen filter, and not by the trainer of flat"
     " splats (2DGS), whose files look the same; if it was trained antialiased, say so (--screen-filter antialiased)"
+)
+
+SIZE_UNKNOWN = (
+    "x1 is taken to be the size of the cameras, but gsplat's trainer shrinks photographs by data_factor, 4 by default, which only its cfg.yml tells:"
+    " give the result folder, or for splats in memory the trainer's own cameras (Camera.of_matrices)"
 )
 
 # Larger numbers overflow float32; a text may have any number of digits.
@@ -74,8 +79,10 @@ class GsplatHost:
     def as_trained(self, cameras: Sequence[Camera], capture: Capture, means: Tensor) -> list[Camera]:
         """The cameras resized by `data_factor`, in the normalized frame, which is recomputed from the cameras and points.
 
-        Those of which `test_every` tells are for testing.
+        Those of which `test_every` tells are for testing. Warns where no options tell of these.
         """
+        if not self.options:
+            warn(SIZE_UNKNOWN)
         points, resized = capture.points, _shrunk(self._split(cameras), int(_positive(self.options, "data_factor", 1)), capture)
         if not self.options.get("normalize_world_space", True):  # always on before version 1.4, which had no such option
             return resized
