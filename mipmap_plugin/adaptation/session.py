@@ -86,7 +86,7 @@ class Session:
     def _choose_views(self, cameras: list[Camera]) -> tuple[list[Camera], list[Camera], str]:
         """The views to adapt to, the views for validation, and a description of the former."""
         with self._looking():
-            chosen, note = choose_views(cameras, self.viewpoints, self.config)
+            chosen, note = choose_views(cameras, replace(self.viewpoints, beside=True), self.config)
             views, validation = split_validation(cameras, chosen, self.viewpoints, self.scale, self.config)
         note += f", {len(chosen) - len(views)} of them kept for validation" if len(views) < len(chosen) else ""
         shown = showing(validation, means_at(self.base, chosen[0]), self.drawn.base.near_plane)

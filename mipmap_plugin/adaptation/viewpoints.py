@@ -55,12 +55,16 @@ HURRIED = f"the time budget leaves no time to look for views that see this captu
 
 @dataclass(frozen=True)
 class Viewpoints:
-    """Of a scene without cameras: what views go around, and which of them see it clearly."""
+    """Of a scene without cameras: what views go around, and which of them see it clearly.
+
+    Views beside the middle are for steps alone: among those for validation, as one that a viewer draws at 6 dB, they took back steps of a capture.
+    """
 
     orbit: Orbit
     clear: Callable[[Sequence[Camera]], list[Camera]]  # those of the views that see it clearly (`ClearViews`)
     looks: float = math.inf  # so many views may be looked at (`amount.looks_in_budget`)
     finer: bool = True  # whether a fifth of the views are finer (`Orbit.finer`); False for views that take the place of the training's
+    beside: bool = False  # whether half of the views in place of unclear ones look beside the middle, unless colors tell where cameras were
 
     def views(self, size: tuple[int, int], count: int, generator: torch.Generator) -> list[Camera]:
         """`count` views of `size` (height, width) px. Of a capture they are clear: fewer where fewer are, and any, with a warning, where none is."""
@@ -87,7 +91,8 @@ class Viewpoints:
             missing = count - len(found)
             most = int(min(math.ceil(missing * tried / max(1, len(found))), count, self.looks - tried))
             if most > 0:
-                looked_at = evenly(self.orbit.views(size, count, generator, number * count), most)
+                others = self.orbit.views(size, count, generator, number * count, beside=self.beside and not self.orbit.seen)
+                looked_at = evenly(others, most)
                 found, tried = found + evenly(self.clear(looked_at), missing), tried + most
         if not found:
             warn(UNCLEAR)

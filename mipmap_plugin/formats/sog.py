@@ -35,6 +35,9 @@ READABLE = 0o644
 # Which three numbers of a quaternion (w, x, y, z) are stored where that of each index is the largest, and the byte that says so.
 OTHERS, LARGEST_IS_W = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]), 252
 
+# What to do about an unpacked SOG some of whose files are missing.
+WHOLE_FOLDER = "copy or download its whole folder again"
+
 # Log scales this far below a splat's longest axis, or below the longest of all, cannot be told apart by the eye, and would only spread the codes.
 FLATTEST, SMALLEST = 12.0, 25.0
 
@@ -132,7 +135,7 @@ def environment_of(streamed: Path) -> list[Path]:
         return []
     trusted = environment.is_relative_to(streamed.parent.resolve()) and (environment.suffix == ".sog" or environment.name == "meta.json")
     if not (trusted and environment.is_file()):
-        raise CheckpointError(f"{streamed} names an environment that is missing, {str(name)[:120]}; copy or download its whole folder again")
+        raise CheckpointError(f"{streamed} names an environment that is missing, {str(name)[:120]}; {WHOLE_FOLDER}")
     return [environment]
 
 

@@ -115,7 +115,7 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
     Raises CheckpointError.
     """
     from mipmap_plugin.formats.damage import damage_of  # and NumPy, without which options are read
-    from mipmap_plugin.formats.sog import completed, environment_of
+    from mipmap_plugin.formats.sog import WHOLE_FOLDER, completed, environment_of
 
     name, ending = EXCHANGE[kind]
     tool = find_tool()
@@ -137,7 +137,8 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
         if reason := run_tool(tool, inputs, plain):
             if answer([*tool, "--version"]) is None:  # as where packages that it needs are missing, or with an old Node.js
                 raise CheckpointError(f"{path} is {name}, which {TOOL} reads, but {TOOL} does not start ({reason}); run: {INSTALL}")
-            raise CheckpointError(f"{path} is {name}, but {TOOL} does not read it ({reason}); export it again")
+            advice = WHOLE_FOLDER if path.suffix == ".json" and "ENOENT" in reason else "export it again"  # Node.js' word for a missing file
+            raise CheckpointError(f"{path} is {name}, but {TOOL} does not read it ({reason}); {advice}")
         try:
             _settle_frame(tool, source, plain)
             _settle_mode(_mode(source, kind), plain)

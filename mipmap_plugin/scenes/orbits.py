@@ -40,6 +40,11 @@ SHARP_FOCAL = 400 / math.tan(ORBIT_FOV / 2)  # of pictures of 800 px
 # is adapted to larger pixels than it is seen with looks worse than its base. So in every fifth view (EVERY) pixels are half as large (FINER).
 FINER, EVERY = 2.0, 5
 
+# What lies beside the middle of a capture is in few views of an orbit where walls leave only some of them clear, and its splats, which steps move as
+# far as others, would look wrong to whoever turns there. So of the views in place of others half (BESIDE, of each four) are turned right or left, by
+# half of TURN (radians) to all of it.
+BESIDE, TURN = (1, 2), math.radians(40)
+
 # Largest ratio of the extent along y to those along x and z at which y is assumed to be vertical.
 FLATTER = 0.8
 
@@ -114,10 +119,10 @@ class Orbit:
         name = next((name for name, axis in AXES.items() if axis == self.up), f"({', '.join(f'{part:.3g}' for part in self.up)})")
         return f"{where}, with {name} up"
 
-    def views(self, size: tuple[int, int], count: int, generator: torch.Generator, first: int = 0) -> list[Camera]:
+    def views(self, size: tuple[int, int], count: int, generator: torch.Generator, first: int = 0, beside: bool = False) -> list[Camera]:
         """`count` views of `size` (height, width) px: from above the horizon, or from all around where no vertical is known (the highest first).
 
-        `first`: the number of the first of them, in their names.
+        `first`: the number of the first of them, in their names. `beside`: half of them look beside the center.
         """
         if count < 1:
             raise SettingsError(f"an orbit needs views, but got {count}")
@@ -127,8 +132,10 @@ class Orbit:
         # them would be in the same half of the validation views.
         far = [self.distance if i // 2 % 2 == 0 else self.nearest or self.distance for i in range(count)]
         focals = [self.focal * each / (self.nearest or each) for each in far]  # so that all show the middle in the same detail
+        eyes = [center + far[i] * way for i, way in enumerate(directions)]
+        aims = [_beside(center, eye, vertical, generator) if beside and i % 4 in BESIDE else center for i, eye in enumerate(eyes)]
         views = [
-            _looking_at(center, center + far[i] * way, vertical, size, f"orbit_{first + i:04d}", focals[i]) for i, way in enumerate(directions)
+            _looking_at(aim, eye, vertical, size, f"orbit_{first + i:04d}", focals[i]) for i, (aim, eye) in enumerate(zip(aims, eyes, strict=True))
         ]
         return [_part(view, generator) for view in views]
 
@@ -206,6 +213,15 @@ def _directions(up: Tensor, turns: Tensor, height: Tensor) -> Tensor:
     north: Tensor = torch.linalg.cross(up, east)
     azimuth = turns * 2 * math.pi
     return (1 - height**2).sqrt() * (azimuth.cos() * east + azimuth.sin() * north) + height * up
+
+
+def _beside(target: Tensor, eye: Tensor, up: Tensor, generator: torch.Generator) -> Tensor:
+    """What an eye sees as far away as `target` that turns right or left by half of TURN to TURN."""
+    forward, (side, more) = target - eye, torch.rand(2, generator=generator, dtype=target.dtype).tolist()
+    right = torch.linalg.cross(forward, up)
+    angle = math.copysign(TURN * (1 + more) / 2, side - 0.5)
+    turned: Tensor = eye + math.cos(angle) * forward + math.sin(angle) * forward.norm() / right.norm() * right
+    return turned
 
 
 def _looking_at(target: Tensor, eye: Tensor, up: Tensor, size: tuple[int, int], name: str, focal: float = 0.0) -> Camera:

@@ -233,6 +233,15 @@ def test_an_environment_that_is_not_in_the_folder_is_refused(tmp_path, tool, nam
     assert f"names an environment that is missing, {name}; copy or download its whole folder again" in sentence(tmp_path / "streamed")
 
 
+@pytest.mark.parametrize("name, advice", [("lod-meta.json", "copy or download its whole folder again"), ("a.sog", "export it again")])
+def test_of_a_folder_that_is_not_whole_it_is_said_so(tmp_path, tool, name, advice):
+    """As where only the lod-meta.json was downloaded, which names the others."""
+    missing = "ENOENT: no such file or directory, stat '0_0/meta.json'"
+    answer_by(tool, f'sys.exit("✗ Error: {missing}") if "--version" not in sys.argv else print("splat-transform v3.7.0 (0f60b17)", file=sys.stderr)')
+    (tmp_path / name).write_text(json.dumps({"lodLevels": 1, "filenames": ["0_0/meta.json"], "tree": {}}))
+    assert sentence(tmp_path / name).endswith(f"is SOG, but splat-transform does not read it ({missing}); {advice}")
+
+
 def test_a_splat_transform_that_does_not_start_is_no_fault_of_the_file(tmp_path, tool):
     answer_by(tool, "sys.exit(\"Error [ERR_MODULE_NOT_FOUND]: Cannot find package 'webgpu'\")")
     (tmp_path / "a.spz").write_bytes(SPZ)
