@@ -51,9 +51,10 @@ class AdaptationPage:
     def __init__(self, checkpoint: Path, targets: Sequence[Path], overwrite: bool, *, all_finished: bool) -> None:
         """Raises now the errors that writing the page would raise: OutputExists and OutputError. `all_finished`: no file is made, so that a page
         that is there stays."""
+        from mipmap_plugin.models.adapted_name import name_of
         from mipmap_plugin.models.places import PAGE_ENDING
 
-        name, target, self.of_one = named(checkpoint).name, named(targets[0]), len(targets) == 1
+        name, target, self.of_one = name_of(checkpoint), named(targets[0]), len(targets) == 1
         self.path = target.with_name(f"{target.name if self.of_one else f'{name}_adapted'}{PAGE_ENDING}")
         self._title, self._overwrite, self._zooms = name, overwrite, list[Any]()
         self.stays = all_finished and self.path.is_file()

@@ -24,8 +24,7 @@ OWN_VIEWERS = ("gsplat", "gsplat-antialiased", "nerfstudio", "nerfstudio-antiali
 
 
 def adapted_name(checkpoint: Path, scale: float, viewer: str | None = None) -> str:
-    """NAME_x0.25 or NAME_x0.25_spark, with the ending of what is saved; none for a folder. NAME is that of a link, not of what it leads to, and
-    MODEL_iteration_7000 of one iteration of a model folder.
+    """NAME_x0.25 or NAME_x0.25_spark, with the ending of what is saved; none for a folder. NAME is that of `name_of`.
 
     The ending is that of the file, but for these:
     - an exchange format that is only read, or has another ending, and a PLY in a zip archive: .ply;
@@ -33,10 +32,15 @@ def adapted_name(checkpoint: Path, scale: float, viewer: str | None = None) -> s
     - a third-party family: the one that it names (`Family.saves`), or .ply for any viewer;
     - what gsplat and nerfstudio save: none, as it becomes a folder of theirs, or .ply for a viewer of others.
     """
-    model = model_of(checkpoint)
-    name = f"{model.name}_{named(checkpoint).name}" if model else named(checkpoint).name
+    name = name_of(checkpoint)
     read, written = _endings(checkpoint, name, viewer)
     return f"{name[: len(name) - len(read)]}_x{scale:g}{f'_{viewer}' if viewer else ''}{written}"
+
+
+def name_of(checkpoint: Path) -> str:
+    """The name of a checkpoint among others: that of a link, not of what it leads to, and MODEL_iteration_7000 of one iteration of a model folder."""
+    model = model_of(checkpoint)
+    return f"{model.name}_{named(checkpoint).name}" if model else named(checkpoint).name
 
 
 def model_of(checkpoint: Path) -> Path | None:

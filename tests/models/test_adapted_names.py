@@ -7,7 +7,7 @@ from torch_checkpoints import gsplat_folder, splatfacto_folder, splats
 
 from mipmap_plugin.cli import main
 from mipmap_plugin.commands.outputs import adapted_path
-from mipmap_plugin.commands.pages import evaluation_page_path
+from mipmap_plugin.commands.pages import AdaptationPage, evaluation_page_path
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.adapted_name import adapted_name
 
@@ -65,3 +65,13 @@ def test_what_is_adapted_from_one_step_lies_beside_the_run_where_nerfstudio_look
     assert (tmp_path / "run" / step).is_file()
     assert adapted_path(tmp_path / "run" / step, None, 1 / 4, several=False) == tmp_path / name
     assert adapted_path(tmp_path / "run" / step, None, 1 / 4, "spark", several=False) == tmp_path / for_spark
+
+
+def test_the_pages_of_iterations_of_two_models_have_names_of_their_own(tmp_path):
+    """Both lie beside the model folders."""
+    paths = []
+    for name in ("bicycle", "garden"):
+        given = write_model_folder(tmp_path / name, 7000) / "point_cloud/iteration_7000"
+        targets = [adapted_path(given, None, scale, several=True) for scale in (1 / 2, 1 / 4)]
+        paths.append(AdaptationPage(given, targets, overwrite=False, all_finished=False).path)
+    assert paths == [tmp_path / f"{name}_iteration_7000_adapted.report.html" for name in ("bicycle", "garden")]
