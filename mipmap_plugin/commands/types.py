@@ -140,7 +140,7 @@ def refuse_repeated(command: Callable[..., Any], words: Sequence[str]) -> None:
     for option in options:
         name = option.removeprefix("--").replace("-", "_")
         hint, is_switch = hints.get(name), bool in (hints.get(name), hints.get(name.removeprefix("no_")))
-        if options.count(option) > 1 and not is_switch and tyro.conf.UseAppendAction not in getattr(hint, "__metadata__", ()):
+        if options.count(option) > 1 and not is_switch and not _is_appended(hint):
             how = ", with all its values behind it" if get_origin(hint) is tuple else ""
             raise SettingsError(f"{option} is given {options.count(option)} times, of which only the last would count; give it once{how}")
 
@@ -156,7 +156,14 @@ def refuse_stray_scales(command: Callable[..., Any], words: Sequence[str]) -> No
         values += 1
         stray = values > 1 if option == "--scale" else "/" in word and (values > 1 or not option)
         if stray and _is_scale(word) and not Path(word).exists() and "scale" in signature(command).parameters:
-            raise SettingsError(f"{word}: each scale is given by an option of its own, as in --scale 1/2 --scale 1/4")
+            several = _is_appended(get_type_hints(command, include_extras=True)["scale"])
+            how = "each scale is given by an option of its own, as in --scale 1/2 --scale 1/4" if several else "give one scale, as in --scale 1/4"
+            raise SettingsError(f"{word}: {how}")
+
+
+def _is_appended(hint: Any) -> bool:
+    """Whether an option with this type may be given several times."""
+    return tyro.conf.UseAppendAction in getattr(hint, "__metadata__", ())
 
 
 def _is_scale(word: str) -> bool:

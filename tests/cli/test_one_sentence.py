@@ -219,6 +219,11 @@ def test_a_scale_without_an_option_of_its_own_is_no_checkpoint(run, words):
     refused(run("adapt", *words.split()), "1/8: each scale is given by an option of its own, as in --scale 1/2 --scale 1/4")
 
 
+def test_a_command_that_takes_one_scale_does_not_ask_for_two(run):
+    for words in ("a.ply --scale 1/2 1/4", "a.ply 1/4"):
+        refused(run("render", *words.split()), "1/4: give one scale, as in --scale 1/4")
+
+
 def test_further_decimal_scales_are_told_from_other_numbers(run, tmp_path, monkeypatch):
     refused(run("tradeoff", "a.ply", "--scale", "0.5", "0.25", "--output", "o"), "0.25: each scale is given by")
     monkeypatch.chdir(tmp_path)
