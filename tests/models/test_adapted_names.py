@@ -53,6 +53,15 @@ def test_what_is_adapted_from_an_iteration_lies_beside_the_model_folder_where_3d
     assert adapted_path(tmp_path / "iteration_7000", None, 1 / 4, several=False) == tmp_path / "iteration_7000_x0.25"
 
 
+@pytest.mark.parametrize("linked", ["bicycle", "bicycle/point_cloud"])
+def test_a_link_around_an_iteration_is_not_followed(tmp_path, linked):
+    """As to a larger disk: what 3DGS looks through is there, too."""
+    folder = write_model_folder(tmp_path / "bicycle", 7000)
+    (tmp_path / linked).rename(tmp_path / "elsewhere")
+    (tmp_path / linked).symlink_to(tmp_path / "elsewhere")
+    assert adapted_path(folder / "point_cloud/iteration_7000", None, 1 / 4, several=False) == tmp_path / "bicycle_iteration_7000_x0.25"
+
+
 @pytest.mark.parametrize(
     ("make", "step", "name", "for_spark"),
     [
