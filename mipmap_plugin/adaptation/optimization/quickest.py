@@ -10,7 +10,7 @@ from mipmap_plugin.adaptation.optimization.costs import Costs
 from mipmap_plugin.process import threads
 
 # Steps of a trial with each number of threads; the shortest counts, because others are longer by chance. One step with one thread is enough if it
-# takes longer than all of those with all threads: on many cores it takes as long as many of them.
+# takes longer than the slowest of those with all threads: on many cores it takes as long as many of them.
 TRIED = 3
 
 # Steps from one trial to the next: twice as many each time that it ends as the one before, for all threads are mostly better or mostly worse.
