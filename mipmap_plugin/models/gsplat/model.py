@@ -44,7 +44,7 @@ UNKNOWN = (
 
 SIZE_UNKNOWN = (
     "x1 is taken to be the size of the cameras, but gsplat's trainer shrinks photographs by data_factor, 4 by default, which only its cfg.yml tells:"
-    " give the result folder, or for splats in memory the trainer's own cameras (Camera.of_matrices)"
+    " give the result folder with that file, or for splats in memory the trainer's own cameras (Camera.of_matrices)"
 )
 
 # Larger numbers overflow float32; a text may have any number of digits.
