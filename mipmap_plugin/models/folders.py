@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.models.families import FAMILIES, find_family
 from mipmap_plugin.models.family import Family, Files
 from mipmap_plugin.models.others import PHOTOGRAPHS
-from mipmap_plugin.models.places import REPORT
+from mipmap_plugin.models.places import has_report
 
 # Columns of plain point clouds and meshes, among which are the points that a training starts from: input.ply, points3D.ply, sparse_pc.ply.
 OF_POINTS = frozenset(
@@ -86,7 +87,8 @@ def model_folders_below(folder: Path) -> list[Path]:
 
 def _was_adapted(folder: Path) -> bool:
     """Whether a model folder has the report of an adaptation beside its checkpoint. One that lies beside a file adapted from it does not count."""
-    return any(any(folder.glob(f"{splats}{REPORT}")) for splats in ("*/*.pt", "*/*.ckpt", "point_cloud/*/point_cloud.ply"))
+    of_families = (file for _, steps in checkpoints_in(folder, below=True) for file in steps.values())
+    return any(map(has_report, chain(of_families, folder.glob("point_cloud/*/point_cloud.ply"))))
 
 
 def is_model_folder(folder: Path) -> bool:

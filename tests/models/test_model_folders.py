@@ -53,6 +53,15 @@ def test_a_folder_above_its_checkpoints_names_them(tmp_path):
         detect(tmp_path / "scenes")
 
 
+def test_a_run_in_which_a_file_adapted_from_its_step_lies_is_no_adaptation(tmp_path):
+    for name in ("garden", "garden_x0.25"):
+        torch_checkpoints.gsplat_folder(tmp_path / name, torch_checkpoints.splats())
+    (tmp_path / "garden/ckpts/small.pt.adaptation.json").write_text("{}")
+    (tmp_path / "garden_x0.25/ckpts/ckpt_6999_rank0.pt.adaptation.json").write_text("{}")
+    with pytest.raises(CheckpointError, match=r"lies above its checkpoint; give .*garden$"):
+        detect(tmp_path)
+
+
 def test_folders_without_an_answer(tmp_path):
     folder = write_model_folder(tmp_path / "m", 7000)
     with pytest.raises(CheckpointError, match="has no iteration_5; it has 7000"):

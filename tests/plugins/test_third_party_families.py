@@ -182,6 +182,16 @@ def test_training_results_are_found_where_the_family_keeps_them(tmp_path):
     assert detect(tmp_path / "run", iteration=5).path.name == "step_5.ply"
 
 
+def test_above_a_run_its_adaptations_are_not_named(tmp_path):
+    for name in ("run", "run_x0.25"):
+        (tmp_path / name / "weights").mkdir(parents=True)
+        ply(tmp_path / name / "weights/step_5.ply", "mine")
+    (tmp_path / "run_x0.25/weights/step_5.ply.adaptation.json").write_text("{}")
+    register_model("mine", custom_family(place=("weights", r"step_(?P<step>\d+)\.ply")))
+    with pytest.raises(CheckpointError, match=r"lies above its checkpoint; give .*run$"):
+        detect(tmp_path)
+
+
 def test_a_place_that_another_family_shares_is_no_claim(tmp_path):
     (tmp_path / "run/ckpts").mkdir(parents=True)
     torch.save({"splats": {}}, tmp_path / "run/ckpts/ckpt_29999_rank0.pt")
