@@ -41,8 +41,8 @@ INTRO = """# What more cores would bring
 
 Made by `python benchmarks/cores.py DATA`: seconds of `adapt` (`default`), on paper: one thread computed everything, and each piece that threads
 share was put on the clock of one of them. The first number lets all threads run torch and Python at the same time, the second one of them at a
-time; the truth lies between, as torch lets others run and Python does not. *Alone*: what is neither in kernels nor in views side by side. Without
-the start of a process (about a second).
+time; the truth should lie between, as torch lets others run and Python does not. *Alone*: what is neither in kernels nor in views side by side.
+Without the start of a process (about a second).
 """
 HEAD = ("scene", "scale", "splats", "cores", "seconds", "times as fast", "alone")
 
