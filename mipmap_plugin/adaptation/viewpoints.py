@@ -57,7 +57,7 @@ HURRIED = f"the time budget leaves no time to look for views that see this captu
 class Viewpoints:
     """Of a scene without cameras: what views go around, and which of them see it clearly.
 
-    Views beside the middle are for steps alone: among those for validation, as one that a viewer draws at 6 dB, they took back steps of a capture.
+    Views beside the middle are for steps alone: a single one in validation, of fog that a viewer draws at 6 dB, had a capture's steps taken back.
     """
 
     orbit: Orbit

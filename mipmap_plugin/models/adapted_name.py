@@ -45,9 +45,11 @@ def name_of(checkpoint: Path) -> str:
 
 def model_of(checkpoint: Path) -> Path | None:
     """The model folder of one iteration: of a folder `point_cloud/iteration_<N>`, or the file of a step of gsplat or nerfstudio; None for any other
-    path. 3DGS and nerfstudio do not find the newest where anything else lies in there, so what is adapted from one does not.
+    path. 3DGS and nerfstudio do not find the newest where anything else lies in there (`searchForMaxIteration`, `eval_load_checkpoint`), so what is
+    adapted from one does not.
 
-    Links are not followed: the folder is the one that the path names, also where a part of it lies on another disk."""
+    Links are not followed: the folder is the one that the path names, also where a part of it lies on another disk.
+    """
     place = absolute(checkpoint) if ".." in checkpoint.parts else checkpoint.absolute()
     if checkpoint.is_dir():
         model, iteration = around(place / "point_cloud.ply")
