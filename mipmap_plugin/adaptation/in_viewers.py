@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -79,6 +79,22 @@ def better_as_trained(as_trained: float | None, psnr: float, effects: Effects) -
         return []
     own = f"drawn as its training drew it ({effects.screen_filter} {effects.eps2d:g} px²), the base itself has {as_trained:.2f} dB"
     return [f"{own} on the same views, more than this file's {psnr:.2f}: for a renderer that draws so, adapt without a viewer"]
+
+
+def worse_viewers(viewers: Iterable[str], before: Sequence[float], after: Sequence[float]) -> list[str]:
+    """That a file for several viewers looks worse than the base in some of them, in a sentence; none where it does not, or is for one viewer.
+
+    `before`, `after`: dB in each viewer as far as differences are visible.
+    """
+    worse = {name: (then, now) for name, then, now in zip(viewers, before, after, strict=True) if then > now + HARM_DB}
+    if not worse or len(before) < 2:
+        return []
+    most = max(worse, key=lambda name: worse[name][0] - worse[name][1])
+    then, now = worse[most]
+    names = f"{' and '.join(worse)} {'show' if len(worse) > 1 else 'shows'}"
+    where = f"of the {len(before)} viewers that it was chosen by, {names} the file worse than the base"
+    told = f"{where}, by up to {then - now:.1f} dB as far as differences can be seen ({then:.1f} -> {now:.1f})"
+    return [f"{told}: for such a viewer make a file of its own (--viewer {most})"]
 
 
 def too_far_out(model: SplatModel, views: Sequence[Camera], targets: Mapping[str, Effects]) -> str:

@@ -12,7 +12,7 @@ from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch
 from mipmap_plugin.adaptation.drawn import Drawn
 from mipmap_plugin.adaptation.following import Following, release
-from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_trained, psnr_per_viewer, too_far_out
+from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_trained, psnr_per_viewer, too_far_out, worse_viewers
 from mipmap_plugin.adaptation.moments import at_their_moments, evaluate_moments
 from mipmap_plugin.adaptation.optimization.amount import affordable_for_model, affordable_moments, fewer_note, looks_in_budget, takes_steps
 from mipmap_plugin.adaptation.optimization.budget import for_upsampling, no_steps_notes, plan_note, within_budget
@@ -172,7 +172,7 @@ class Session:
         allowed = [name for name, model in states.items() if len(model.parameters()["means"]) <= self._most_splats]
         began, (base, start, *_), last = now(self.device), states, allowed[-1]
         with self.phase("validation"):
-            best, psnrs, by_view = self.validation.choose(states, allowed)
+            best, psnrs, by_view, by_viewer = self.validation.choose(states, allowed)
         self.seconds["total"] += now(self.device) - began
         if self.config.returns == "last":
             best = last
@@ -180,7 +180,7 @@ class Session:
             best = last  # a network adds detail that the base's own image does not have, so that its gain cannot be measured
         elif self.detail is None and self.wanted is None:
             worse = worse_views(self.validation.choosing, by_view[base], by_view[best], self.scale, orbit=self._orbits)
-            self.notes = [*self.notes, *worse]
+            self.notes = [*self.notes, *worse, *worse_viewers(self.drawn.extremes, by_viewer[base], by_viewer[best])]
         note = "" if best == last else f": {psnrs[best]:.2f} dB on validation views, {last} {psnrs[last]:.2f} dB"
         seconds, count = self.seconds["total"], count_of(states[last], self.views[0], self.scale)
         at_end = CurvePoint(step=0, seconds=seconds, validation_db=psnrs[last], gaussians=count)

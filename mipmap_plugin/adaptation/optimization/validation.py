@@ -81,6 +81,15 @@ class Quality(NamedTuple):
         return cls(*(decibel(fmean(10 ** (-mean(each) / 10) for each in errors)) for mean in (_visible_db, mean_db)))
 
 
+class Choice(NamedTuple):
+    """The state that is returned, and how good each state is, by its name."""
+
+    state: str
+    psnrs: dict[str, float]  # dB in the worst viewer
+    by_view: dict[str, list[float]]  # dB of each view, as far as differences are visible
+    by_viewer: dict[str, list[float]]  # dB in each viewer, likewise
+
+
 @dataclass(frozen=True)
 class Validation:
     """Views of the base scale, the truth of each, and the comparison of a model with it."""
@@ -128,16 +137,17 @@ class Validation:
         """The quality on the steering views."""
         return Quality.of(self._errors(model, self.steering))
 
-    def choose(self, states: dict[str, SplatModel], allowed: Collection[str] | None = None) -> tuple[str, dict[str, float], dict[str, list[float]]]:
-        """The state of the best visible quality, of those that are `allowed`, each state's PSNR in its worst viewer, and its visible dB of each view.
+    def choose(self, states: dict[str, SplatModel], allowed: Collection[str] | None = None) -> Choice:
+        """The state of the best visible quality, of those that are `allowed`.
 
         Of states that are equal the last, but none that is worse than the first of `states`, which is what went in.
         """
         errors = {name: self._errors(model, self.choosing) for name, model in states.items()}
-        quality = {name: min(map(_visible_db, each)) for name, each in errors.items()}
+        by_viewer = {name: [*map(_visible_db, each)] for name, each in errors.items()}
+        quality = {name: min(each) for name, each in by_viewer.items()}
         chosen = last_of_best({name: quality[name] for name in states if allowed is None or name in allowed}, next(iter(states)))
         by_view = {name: [_visible_db([fmean(one)]) for one in zip(*each, strict=True)] for name, each in errors.items()}
-        return chosen, {name: min(map(mean_db, each)) for name, each in errors.items()}, by_view
+        return Choice(chosen, {name: min(map(mean_db, each)) for name, each in errors.items()}, by_view, by_viewer)
 
 
 def _drawing(

@@ -134,7 +134,7 @@ class LevelRun:
             self.seconds["optimization"] = run.watch.seconds - self.seconds["total"] - run.costs.seconds()
             curve, kept, self.seconds["total"] = run.curve, keeper.remaining_file(), run.watch.seconds
         with announced(f"level {self.number}: validation"):
-            best, psnrs, _ = self.validation.choose(states)
+            best, psnrs, *_ = self.validation.choose(states)
             psnrs[AS_FINER] = self._as_finer(lambda finer: self.validation.viewer_psnrs(finer, self.validation.choosing)[0])
         report = self._report(states[best], curve, ended_by, best, psnrs)
         effects = {str(self.scene.request.viewer): self.scene.target}

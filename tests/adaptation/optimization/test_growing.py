@@ -173,7 +173,7 @@ def test_rows_that_are_as_many_but_others_have_no_columns_of_the_base(monkeypatc
     """Pruned after the first step, and grown to as many as the base has, which is where growing ends, after the second."""
     found = iter([30.0, 40.0, 39.0])  # in the beginning, after step 2, after step 4
     monkeypatch.setattr(Validation, "quality", lambda self, model: Quality(*[next(found)] * 2))
-    chosen = lambda states: (list(states)[2], dict.fromkeys(states, 0.0), dict.fromkeys(states, ()))  # noqa: E731
+    chosen = lambda states: (list(states)[2], dict.fromkeys(states, 0.0), dict.fromkeys(states, ()), dict.fromkeys(states, (0.0,)))  # noqa: E731
     monkeypatch.setattr(Validation, "choose", lambda self, states, allowed: chosen(states))
     base = tiny.model(40).with_extras({"confidence": np.arange(40, dtype=np.float32)})
     rates = LearningRates(means=0.05, scales=0.02, quats=0.004, opacities=0.05, sh0=0.015, shN=0.02)  # with which one splat is pruned

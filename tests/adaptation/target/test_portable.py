@@ -12,8 +12,9 @@ import tiny
 import torch
 
 from mipmap_plugin import cli, register_viewer, wrap_model
+from mipmap_plugin.adaptation.in_viewers import worse_viewers
 from mipmap_plugin.adaptation.optimization.run import Task
-from mipmap_plugin.adaptation.optimization.validation import VISIBLE_ERROR, Validation
+from mipmap_plugin.adaptation.optimization.validation import VISIBLE_ERROR, Choice, Validation
 from mipmap_plugin.adaptation.start.candidates import StartSearch
 from mipmap_plugin.adaptation.target.portable import MERGE_FACTOR, MERGING_COSTS, extreme_targets, median_target
 from mipmap_plugin.backends import choose_backend
@@ -181,6 +182,30 @@ def test_the_report_has_each_viewer_and_the_file_says_what_it_is(tmp_path):
     assert adapted.effects == Effects(1)  # classic
     comments = read_ply(adapted.save(tmp_path / "new.ply")).comments
     assert provenance_of(comments)["viewer"] == "portable" and "SplatRenderMode: default" in comments
+
+
+def test_viewers_that_a_file_for_several_suits_less_than_the_base_are_told_of():
+    """Of four two: another loses too little to count, and the first gains."""
+    told = worse_viewers(("classic", "spark", "three", "mip"), [20.0, 36.5, 38.0, 41.0], [30.0, 35.5, 37.95, 38.0])
+    assert told == [
+        "of the 4 viewers that it was chosen by, spark and mip show the file worse than the base, by up to 3.0 dB as far as differences can be seen "
+        "(41.0 -> 38.0): for such a viewer make a file of its own (--viewer mip)"
+    ]
+    assert not worse_viewers(("spark",), [36.0], [30.0]) and not worse_viewers(PAIR, [20.0, 36.0], [30.0, 36.0])
+
+
+def test_the_report_tells_of_such_viewers(monkeypatch, pair):
+    """In the first the file gains 10 dB, in the second it loses 4."""
+
+    def choose(self, states, allowed):
+        *_, last = states
+        dbs = {name: (30.0, 32.0) if name == last else (20.0, 36.0) for name in states}
+        return Choice(last, dict.fromkeys(states, 20.0), {name: [20.0 for _ in self.choosing] for name in states}, dbs)
+
+    monkeypatch.setattr(Validation, "choose", choose)
+    with pytest.warns(UserWarning, match=r"spark shows the file worse than the base, by up to 4.0 dB") as told:
+        report = wrapped().adapt(1 / 4, viewer=pair, **BRIEF).report
+    assert any(str(each.message) in report.notes for each in told)
 
 
 def test_a_file_for_one_viewer_has_no_table_of_viewers():
