@@ -179,8 +179,8 @@ class Session:
         elif self.detail is not None and psnrs[last] >= max(psnrs[name] for name in allowed if name in (base, start)) - HARM_DB:
             best = last  # a network adds detail that the base's own image does not have, so that its gain cannot be measured
         elif self.detail is None and self.wanted is None:
-            worse = worse_views(self.validation.choosing, by_view[base], by_view[best], self.scale, orbit=self._orbits)
-            self.notes = [*self.notes, *worse]
+            views, means = self.validation.choosing, means_at(self.base, self.views[0])
+            self.notes = [*self.notes, *worse_views(views, by_view[base], by_view[best], self.scale, means, orbit=self._orbits)]
         note = "" if best == last else f": {psnrs[best]:.2f} dB on validation views, {last} {psnrs[last]:.2f} dB"
         seconds, count = self.seconds["total"], count_of(states[last], self.views[0], self.scale)
         at_end = CurvePoint(step=0, seconds=seconds, validation_db=psnrs[last], gaussians=count)
