@@ -115,9 +115,17 @@ class _Work:
         """A level below a finer one. Where steps regained too little of what merging cost, it is made again, merged as the recipe allows."""
         level = self._made(name, band, arguments)
         merged_further = "start" in arguments and "merging_costs" not in self.request.settings
-        if not merged_further or _better(self.yardstick, finer, level, band.scale) <= MOST_LOST:
+        if not merged_further or not self._merged_too_far(finer, level):
             return level
         return self._made(f"{name}_merged_less", band, {**arguments, "merging_costs": recipe(self.request.recipe, band.scale).merging_costs})
+
+    def _merged_too_far(self, finer: Level, level: Level) -> bool:
+        """Whether a level is so much worse than the finer one at its own scale, or worse than that and than the base as the viewer draws it."""
+        zoom = level.band.scale
+        lost = _better(self.yardstick, finer, level, zoom)
+        if lost <= EVEN or lost > MOST_LOST:
+            return lost > MOST_LOST
+        return self.yardstick.psnr(level.adapted, zoom) < self.yardstick.psnr_of_base(self.request.viewer, zoom)
 
     def _ends(self, coarsest: Level, last: Band) -> bool:
         """Whether the ladder needs no level below its coarsest one, after the band that was the last to be adapted to."""

@@ -62,14 +62,14 @@ def test_a_coarser_level_has_clearly_fewer_splats_than_the_finer_one_or_is_bette
     assert _no_use(level, finer, SimpleNamespace(psnr=lambda each, _: each.psnr)) == reason
 
 
-@pytest.mark.parametrize(("psnr", "splats"), [(27.5, 2), (26.5, 8)])
-def test_a_level_whose_steps_regain_too_little_of_what_merging_cost_is_made_again(monkeypatch, psnr, splats):
-    """It may be 3 dB worse than the finer level, whose PSNR is 30 dB."""
+@pytest.mark.parametrize(("psnr", "base", "splats"), [(27.5, 20, 2), (26.5, 20, 8), (27.5, 28, 8), (29.6, 29.8, 2)])
+def test_a_level_whose_steps_regain_too_little_of_what_merging_cost_is_made_again(monkeypatch, psnr, base, splats):
+    """It may be 3 dB worse than the finer level, whose PSNR is 30 dB, but not worse than the base, unless it is as good as the finer level."""
     monkeypatch.setattr("mipmap_plugin.levels.ladder.MOST_LOST", 3.0)
     few, many = (SimpleNamespace(psnr=db, model=tiny.model(n)) for db, n in ((psnr, 2), (29, 8)))
-    base = SimpleNamespace(adapt=lambda scale, *, merging_costs, **_: few if merging_costs == MERGING_COSTS else many)
-    yardstick = SimpleNamespace(psnr=lambda each, _: each.psnr)
-    work = _Work(base, request(), SimpleNamespace(level=lambda name, make: make(None)), yardstick)
+    frozen = SimpleNamespace(adapt=lambda scale, *, merging_costs, **_: few if merging_costs == MERGING_COSTS else many)
+    yardstick = SimpleNamespace(psnr=lambda each, _: each.psnr, psnr_of_base=lambda *_: base)
+    work = _Work(frozen, request(), SimpleNamespace(level=lambda name, make: make(None)), yardstick)
     made, _ = work._next(Level(SimpleNamespace(psnr=30, model=tiny.model(9)), BAND), BAND, 1, 2.0)
     assert made.splats == splats
 
