@@ -9,6 +9,7 @@ import anchor_checkpoints
 import moving
 import pytest
 import tiny
+import torch
 from brief_levels import BRIEF, request, wrapped
 
 from mipmap_plugin import cli, load_model, wrap_model
@@ -17,7 +18,7 @@ from mipmap_plugin.commands.ladder_summary import print_summary
 from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.levels.contents import LeftOut, Level
 from mipmap_plugin.levels.ladder import NO_FEWER, NOT_BETTER, UNSHOWN, _no_use, _shown, _Work, make_levels
-from mipmap_plugin.levels.manifest import MANIFEST, THREE_JS, base_pixel, read_manifest, refuse_ladder, view_pixel
+from mipmap_plugin.levels.manifest import MANIFEST, THREE_JS, TOLD, base_pixel, looked_at, read_manifest, refuse_ladder, view_pixel
 from mipmap_plugin.levels.request import MERGING_COSTS, Band
 from mipmap_plugin.models.places import state_path
 from mipmap_plugin.models.vanilla import VanillaModel
@@ -151,6 +152,20 @@ def test_the_views_of_the_training_are_at_x1_by_what_they_look_at():
     views, ball = [camera.zoomed(scale) for camera, scale in zip(tiny.cameras(3), (1, 1, 2), strict=True)], tiny.gaussians(500, spread=0.3)
     away = float((views[0].center - ball.means.double().median(0).values).norm())
     assert view_pixel(wrap_model(VanillaModel.from_gaussians(ball), cameras=views)) == pytest.approx(away / views[0].fx, rel=0.05)
+
+
+def test_a_page_sees_the_views_of_the_training_at_x1_also_where_these_look_past_the_middle():
+    """Most of what each shows lies three times as far away as the middle of all splats, and one shows nothing."""
+    views, ball = tiny.cameras(3), tiny.gaussians(200, spread=0.3)
+    away = ball.means.median(0).values - torch.stack([view.center.float() for view in views]).mean(0)
+    scene = replace(tiny.gaussians(300, spread=0.3, seed=2), means=tiny.gaussians(300, spread=0.3, seed=2).means + 2 * away).joined(ball)
+    blind = replace(views[0], viewmat=torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])).to(views[0].viewmat) @ views[0].viewmat)
+    told = torch.tensor(looked_at(wrap_model(VanillaModel.from_gaussians(scene), cameras=[*views, blind])), dtype=torch.float64)
+    assert TOLD / 2 < len(told) <= TOLD + 4
+    for view in views:
+        points = view.to_camera(told[:, :3])
+        zooms = (told[:, 3] * view.fx / points[:, 2])[view.in_picture(points)]
+        assert float(zooms.median()) == pytest.approx(1, rel=0.1)
 
 
 def test_a_ladder_is_saved_when_its_base_is_gone(tmp_path):
