@@ -229,6 +229,17 @@ def test_what_no_viewer_draws_has_no_levels(tmp_path, write, by):
         make_levels(base, request("supersplat", by=by))
 
 
+@pytest.mark.parametrize(
+    ("lost", "told"),
+    [((-2, 0.4, 0.5), ""), ((1, 0.9, 0.2), "at x1 to x0.5 the base alone is better, by up to 1.0 dB"), ((0, 0, 2.6), "at x0.25 the")],
+)
+def test_it_is_told_where_the_base_alone_is_better(tmp_path, capsys, lost, told):
+    curve = [{"zoom": 0.5**number, "psnr_db": 30.0, "base_db": 30.0 + db} for number, db in enumerate(lost)]
+    print_summary(tmp_path, {"viewer": "spark", "levels": [], "switches": [], "curve": curve, "worst_db": 30, "mean_db": 30, "measured": ""})
+    said = capsys.readouterr().out
+    assert told in said if told else "better" not in said
+
+
 def test_no_level_advises_to_leave_out_the_viewer_that_a_ladder_needs(monkeypatch, recwarn):
     monkeypatch.setattr("mipmap_plugin.adaptation.session.psnr_as_trained", lambda *_: 99.0)
     advice = "adapt without a viewer"
