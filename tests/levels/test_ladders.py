@@ -14,8 +14,10 @@ from brief_levels import BRIEF, request, wrapped
 
 from mipmap_plugin import cli, load_model, wrap_model
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report
+from mipmap_plugin.adaptation.warn import held, warn
 from mipmap_plugin.commands.ladder_summary import print_summary
 from mipmap_plugin.errors import OutputExists, SettingsError
+from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.contents import LeftOut, Level
 from mipmap_plugin.levels.ladder import NO_FEWER, NOT_BETTER, UNSHOWN, _no_use, _shown, _Work, make_levels
 from mipmap_plugin.levels.manifest import MANIFEST, THREE_JS, TOLD, base_pixel, looked_at, read_manifest, refuse_ladder, view_pixel
@@ -48,6 +50,27 @@ def test_a_level_that_is_the_base_again_is_left_out(tmp_path, monkeypatch, capsy
     assert [level["file"] for level in manifest["levels"]] == ["level_0.ply", "level_1.ply"] and not (tmp_path / "ladder/level_2.ply").exists()
     print_summary(tmp_path, manifest)
     assert f"no level of its own at x0.5, where a neighbor is shown: {NOT_BETTER}" in capsys.readouterr().out
+
+
+def test_only_of_levels_that_are_kept_is_anything_warned(monkeypatch, recwarn):
+    base, adapt = wrapped(), FrozenBase.adapt
+
+    def warning(self, scale, **options):
+        warn(f"x{scale:g} looks worse")
+        return adapt(self, scale, **options)
+
+    monkeypatch.setattr(FrozenBase, "adapt", warning)
+    monkeypatch.setattr("mipmap_plugin.levels.ladder._no_use", lambda level, *_: NO_FEWER if 0.4 < level.band.scale < 0.6 else None)
+    ladder = make_levels(base, request())
+    assert [left.scale for left in ladder.contents.left_out] == pytest.approx([1 / 2])
+    assert [str(each.message) for each in recwarn if "looks worse" in str(each.message)] == ["x1 looks worse", "x0.25 looks worse"]
+
+
+def test_what_a_level_that_fails_warned_of_is_told(recwarn):
+    with pytest.raises(SettingsError), held():
+        warn("the cameras may be of another scene")
+        raise SettingsError("nothing is drawn")
+    assert [str(each.message) for each in recwarn] == ["the cameras may be of another scene"]
 
 
 @pytest.mark.parametrize(
@@ -83,6 +106,16 @@ def test_a_level_that_is_shown_at_no_zoom_is_left_out():
     shown, switches, left_out = _shown(levels, yardstick, 0.1)
     assert shown == [levels[0], levels[2]] and len(switches) == 1 and 0.25 < switches[0].zoom < 1
     assert left_out == [LeftOut(0.5, 2, UNSHOWN)]
+
+
+@pytest.mark.parametrize(("ends", "kept"), [(0.46, 2), (0.4, 3)])
+def test_a_level_that_is_hardly_shown_is_left_out(ends, kept):
+    """Level 1 is as good as level 0 at x0.47, and as level 2 where it `ends`."""
+    levels = [Level(SimpleNamespace(number=n, model=tiny.model(3 - n)), Band(0.55**n, 0.7 * 0.55**n, 1, 2)) for n in range(3)]
+    dbs = [lambda zoom: 30 + 400 * math.log2(zoom / 0.47), lambda _: 30, lambda zoom: 30 - 400 * math.log2(zoom / ends)]
+    yardstick = SimpleNamespace(psnr=lambda level, zoom: dbs[level.number](zoom), likeness=lambda *_: 30)
+    shown, switches, left_out = _shown(levels, yardstick, 0.1)
+    assert len(shown) == kept == len(switches) + 1 == 3 - len(left_out)
 
 
 def test_a_level_is_not_shown_where_a_coarser_one_is_better(monkeypatch):
