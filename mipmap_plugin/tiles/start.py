@@ -13,10 +13,10 @@ from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.pixel_size import pixel_size
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.base_weights import note_on_hidden, weighed_in_parts
-from mipmap_plugin.adaptation.start.blend_weights import may_show, whole_weights
+from mipmap_plugin.adaptation.start.blend_weights import may_show, wanted_of, whole_weights
 from mipmap_plugin.adaptation.start.candidates import start_name
 from mipmap_plugin.adaptation.start.closed_form import LEAST_AXIS, FormSettings, closed_form, draws_alike, filter_suffices
-from mipmap_plugin.adaptation.start.matching import matched_opacities, sweeps_over
+from mipmap_plugin.adaptation.start.matching import Wanted, matched_opacities, sweeps_over
 from mipmap_plugin.adaptation.start.merging import merge_down, merge_seen
 from mipmap_plugin.adaptation.start.strength import Bounds, Candidate, Merger, MergingCosts
 from mipmap_plugin.camera import Camera
@@ -77,8 +77,8 @@ class StartSearch:
         weights, opacities, self.shown = weights * scene.scale**2, [], []
         for core in scene.cores:
             gaussians = scene.base.gaussians(core, colored=False)
-            _, whole = self._sizes(gaussians)
-            self.shown.append(may_show(weights[core].sum(1), whole, gaussians.means, scene.views.adapted, self.views))
+            whole = whole_weights(gaussians, self._pixel_size(gaussians.means), views, scene.base_effects, scene.scale)
+            self.shown.append(may_show(weights[core].sum(1), whole, gaussians.means, views, self.views))
             opacities.append(gaussians.opacities)
         self.notes = note_on_hidden(torch.cat(self.shown), torch.cat(opacities))
         return weights
@@ -86,11 +86,6 @@ class StartSearch:
     def _pixel_size(self, means: Tensor) -> Tensor:
         """Of a base pixel at means [N, 3], in world units, [N]."""
         return pixel_size(means, self.scene.views.adapted, len(self.views))
-
-    def _sizes(self, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
-        """[N]: of a base pixel at each splat, and of the splat's weight if nothing hid it."""
-        pixel = self._pixel_size(gaussians.means)
-        return pixel, whole_weights(gaussians, pixel, self.scene.views.adapted, self.scene.base_effects, self.scene.scale)
 
     def _merger(self, weights: Tensor) -> Merger[str]:
         """Merges the base's splats, which have these blend weights [N, P], into candidates, which it names."""
@@ -116,14 +111,14 @@ class StartSearch:
         merged = [self._merged(name, number, weights[core], fraction, coarsely) for number, core in enumerate(self.scene.cores)]
         pool.release_to_system()
         if self.forms:
-            self._match(name, *map(torch.cat, zip(*merged, strict=True)))
+            self._match(name, Wanted(*map(torch.cat, zip(*merged, strict=True))))
             pool.release_to_system()
 
-    def _merged(self, name: str, number: int, own: Tensor, fraction: float, coarsely: bool) -> tuple[Tensor, Tensor]:
-        """Write a core's candidate, from its blend weights `own` [N, P]; returns the candidate's, and those that it had if nothing hid it."""
+    def _merged(self, name: str, number: int, own: Tensor, fraction: float, coarsely: bool) -> Wanted:
+        """Write a core's candidate, from its blend weights `own` [N, P]; returns what is wanted of the candidate."""
         scene = self.scene
         model = scene.for_target(scene.base.parameters(scene.cores[number]))
-        whole = torch.empty(0)
+        wanted = Wanted(own, *torch.empty(2, 0))
 
         def pixel_of(means: Tensor) -> Tensor:
             return self._pixel_size(means) / scene.scale
@@ -137,8 +132,9 @@ class StartSearch:
             return splats
 
         def formed(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
-            nonlocal whole
-            pixel, whole = self._sizes(gaussians)
+            nonlocal wanted
+            pixel = self._pixel_size(gaussians.means)
+            wanted = wanted_of(own, gaussians, pixel, scene.views.adapted, scene.base_effects, scene.scale)
             least = LEAST_AXIS if scene.config.steps and scene.config.time_budget_s is None else 0.0
             form = FormSettings(area_power=1.0, views=len(self.views), pixel=pixel, matched=True, least_axis=least)
             return closed_form(gaussians, scene.views.adapted, scene.scale, scene.base_effects, scene.target, form)
@@ -148,13 +144,10 @@ class StartSearch:
         if self.forms:
             model.reshape(formed)
         write_store(self._file(name, number), model.parameters())
-        return own, whole
+        return wanted
 
-    def _match(self, name: str, wanted: Tensor, whole: Tensor) -> None:
-        """Give the splats opacities with which they have the `wanted` blend weights [N, P] (`start.matching`), and write them again.
-
-        `whole` [N]: the weights that they would have if nothing hid them.
-        """
+    def _match(self, name: str, wanted: Wanted) -> None:
+        """Give the splats opacities with which they have the `wanted` blend weights (`start.matching`), and write them again."""
         splats = self._open(name)
         views = [view.zoomed(self.scene.scale) for view in self.views]
         painter = self.scene.painter(self.scene.target)
@@ -164,7 +157,7 @@ class StartSearch:
             return painter.weighed(splats, some, [0] * len(some))[0][:, 0] * (len(some) / len(views))
 
         opacities = torch.cat([part.mapped()[0][:, -1] for part in splats.parts]).sigmoid()
-        opacities = matched_opacities(opacities, wanted, whole, weights_of, sweeps_over(views).usual)
+        opacities = matched_opacities(opacities, wanted, weights_of, sweeps_over(views).usual)
         for number, (part, matched) in enumerate(zip(splats.parts, opacities.split([*map(len, splats.parts)]), strict=True)):
             model = self.scene.for_target(part.parameters())
             model.reshape(lambda gaussians: (gaussians.scales, matched))  # noqa: B023  # it is called at once

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS, pixel_size, views_for
-from mipmap_plugin.adaptation.start.blend_weights import may_show, weighed, whole_weights
+from mipmap_plugin.adaptation.start.blend_weights import may_show, wanted_of, weighed
 from mipmap_plugin.adaptation.start.clock import Clock
-from mipmap_plugin.adaptation.start.matching import PARTS
+from mipmap_plugin.adaptation.start.matching import PARTS, Wanted
 from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.gaussians import Gaussians
@@ -35,7 +35,7 @@ class BaseWeights:
         self.views: list[Camera] = []  # these views
         self.size = 1.0  # fraction of their size at which views are weighed: `HALF`, or less where a time budget leaves no time for large ones
         self.shown = torch.empty(0, dtype=torch.bool)  # which splats views show (`may_show`)
-        self.whole_of_base = torch.empty(0)  # the base's splats' weights if nothing hid them (`whole_weights`)
+        self.of_base = Wanted(*torch.empty(3, 0))  # once it is `measured`
         self.notes: list[str] = []  # on what they show
 
     def measured(self, base: SplatModel) -> Tensor:
@@ -59,15 +59,15 @@ class BaseWeights:
         weights, numbers = weighed_in_parts(len(problem.views), timed, enough)
         self.views = [problem.views[number] for number in numbers]
         weights = weights * problem.scale**2
-        self.whole_of_base = self.whole(gaussians, self.pixel_size(gaussians.means))
-        self.shown = may_show(weights.sum(1), self.whole_of_base, gaussians.means, problem.views, self.views)
+        self.of_base = self.wanted(gaussians, weights)
+        self.shown = may_show(weights.sum(1), self.of_base.whole, gaussians.means, problem.views, self.views)
         self.notes += note_on_hidden(self.shown, gaussians.opacities)
         return weights
 
-    def whole(self, gaussians: Gaussians, pixel: Tensor) -> Tensor:
-        """`whole_weights` of splats [N] where a base pixel has these sizes [N], in world units."""
+    def wanted(self, gaussians: Gaussians, weights: Tensor) -> Wanted:
+        """`wanted_of` splats with these blend weights [N, P]."""
         problem = self._problem
-        return whole_weights(gaussians, pixel, problem.views, problem.base_effects, problem.scale)
+        return wanted_of(weights, gaussians, self.pixel_size(gaussians.means), problem.views, problem.base_effects, problem.scale)
 
     def pixel_size(self, means: Tensor) -> Tensor:
         """`pixel_size` at means [N, 3]; that of the base, which is asked for first, serves all candidates."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.parallel import max_threads, together
 from mipmap_plugin.adaptation.pixel_size import pictured
 from mipmap_plugin.adaptation.start.closed_form import filter_variance
-from mipmap_plugin.adaptation.start.matching import PARTS
+from mipmap_plugin.adaptation.start.matching import PARTS, Wanted
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects, colorless
@@ -78,12 +78,24 @@ def _of_views(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, e
 def whole_weights(gaussians: Gaussians, pixel: Tensor, views: Sequence[Camera], base: Effects, scale: float) -> Tensor:
     """[N]: the blend weight of each splat, in target pixels of a view of the base, if it lay in all pictures and nothing hid it.
 
-    `pixel` [N]: the size of a base pixel there, in world units; `base`: how the base is rendered. The area is the root mean square over all
-    directions, and at most that of a picture.
+    `pixel`, `base`: as of `areas`. The area is at most that of a picture.
+    """
+    picture = sum(view.width * view.height for view in views) / len(views)
+    return gaussians.opacities * (2 * math.pi * areas(gaussians, pixel, base)).clamp_max(picture) * scale**2
+
+
+def areas(gaussians: Gaussians, pixel: Tensor, base: Effects) -> Tensor:
+    """[N], base px²: the product of each splat's two standard deviations in a picture, the root mean square over all directions.
+
+    `pixel` [N]: the size of a base pixel there, in world units; `base`: how the base is rendered.
     """
     a, b, c = ((gaussians.scales / pixel[:, None]).square() + filter_variance(base)).unbind(1)
-    picture = sum(view.width * view.height for view in views) / len(views)
-    return gaussians.opacities * (2 * math.pi * ((a * b + b * c + c * a) / 3).sqrt()).clamp_max(picture) * scale**2
+    return ((a * b + b * c + c * a) / 3).sqrt()
+
+
+def wanted_of(weights: Tensor, gaussians: Gaussians, pixel: Tensor, views: Sequence[Camera], base: Effects, scale: float) -> Wanted:
+    """What splats with these blend weights [N, P] show in the base's images; the others: as of `whole_weights`."""
+    return Wanted(weights, whole_weights(gaussians, pixel, views, base, scale), areas(gaussians, pixel, base) * min(1.0, scale) ** 2)
 
 
 def may_show(weights: Tensor, whole: Tensor, means: Tensor, views: Sequence[Camera], looked_at: Sequence[Camera]) -> Tensor:

@@ -17,6 +17,7 @@ from mipmap_plugin.adaptation.start.base_weights import BaseWeights
 from mipmap_plugin.adaptation.start.clock import Clock, start_clock
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, LEAST_AXIS, FormSettings, closed_form, draws_alike
 from mipmap_plugin.adaptation.start.matcher import Matcher
+from mipmap_plugin.adaptation.start.matching import Wanted
 from mipmap_plugin.adaptation.start.merging import MergingRounds, merge_down, merge_seen
 from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.adaptation.start.strength import POWERS, Bounds, Candidate, Merger, MergingCosts
@@ -139,7 +140,7 @@ class StartSearch:
         if self._learns or not self._forms or not self._matcher.is_of_use or weights is None:
             return formed, quality
         less, better = self._matched_less(formed, quality, weights)
-        further, best = self._matched_further(formed, quality, weights, self._seen.whole_of_base, self._problem.base)
+        further, best = self._matched_further(formed, quality, self._seen.of_base, self._problem.base)
         if less is not formed and better.visible > best.visible:
             return less, better
         self._matcher.wanted = None if further is formed else (*self._matcher.sweeps.usual, *self._matcher.sweeps.further)  # of merged splats too
@@ -163,18 +164,18 @@ class StartSearch:
         return model.gaussians(self._problem.views[0]).opacities >= self._problem.target.settings.min_alpha
 
     def _matched_further(
-        self, formed: SplatModel, quality: Quality, weights: Tensor, whole: Tensor, copied: Callable[[], SplatModel]
+        self, formed: SplatModel, quality: Quality, wanted: Wanted, copied: Callable[[], SplatModel]
     ) -> tuple[SplatModel, Quality]:
         """The closed form, or with opacities matched in further sweeps if it looks no worse by that; and its quality.
 
-        `whole`: as of `Matcher.matched`; `copied`: makes a model of the same splats, whose scales and opacities may be others.
+        `copied`: makes a model of the same splats, whose scales and opacities may be others.
         """
         problem, sweeps = self._problem, self._matcher.sweeps.further
-        if not self._matcher.allows(weights, sweeps):
+        if not self._matcher.allows(wanted.weights, sweeps):
             return formed, quality
         further, splats = copied(), formed.gaussians(problem.views[0]).detach()
         with problem.phase("closed form"):
-            reshape(further, lambda _: (splats.scales, self._matcher.matched(splats, weights, whole, sweeps)), problem.views)
+            reshape(further, lambda _: (splats.scales, self._matcher.matched(splats, wanted, sweeps)), problem.views)
         better = problem.quality(further)
         return (further, better) if better.visible > quality.visible - EVEN else (formed, quality)
 
@@ -185,8 +186,7 @@ class StartSearch:
         self._form(student, weights)
         if self._learns or not self._forms or not self._matcher.is_of_use or weights is None:
             return student
-        whole = self._seen.whole(merged, self._seen.pixel_size(merged.means))
-        return self._matched_further(student, self._problem.quality(student), weights, whole, student.copy)[0]
+        return self._matched_further(student, self._problem.quality(student), self._seen.wanted(merged, weights), student.copy)[0]
 
     def _merged_at_once(self, weights: Tensor | None) -> SplatModel | None:
         """The strongest merging, where a time budget is too short for a search and this is no worse than the base; else None."""
@@ -296,4 +296,4 @@ class StartSearch:
         if weights is None or not sweeps:
             return scales, opacities
         formed = replace(gaussians, scales=scales, opacities=opacities)
-        return scales, self._matcher.matched(formed, weights, self._seen.whole(gaussians, pixel), sweeps)
+        return scales, self._matcher.matched(formed, self._seen.wanted(gaussians, weights), sweeps)

@@ -12,7 +12,7 @@ from mipmap_plugin.adaptation.start.base_weights import BaseWeights
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.clock import Clock
 from mipmap_plugin.adaptation.start.closed_form import filter_suffices
-from mipmap_plugin.adaptation.start.matching import Sweeps, matched_opacities, sweeps_over
+from mipmap_plugin.adaptation.start.matching import Sweeps, Wanted, matched_opacities, sweeps_over
 from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import SURFEL
@@ -52,11 +52,11 @@ class Matcher:
 
     def allows(self, weights: Tensor, sweeps: Sequence[int]) -> bool:
         """Whether there is time for such sweeps over splats of these weights [N, P]: in less of it than the base's if these and pixels are fewer."""
-        share = max(len(weights) / len(self._seen.whole_of_base), (self._size / self._seen.size) ** 2)
+        share = max(len(weights) / len(self._seen.of_base.whole), (self._size / self._seen.size) ** 2)
         return self._clock.allows("weights", share * len(sweeps) * len(self._seen.views) / LEAST_VIEWS)
 
-    def matched(self, splats: Gaussians, weights: Tensor, whole: Tensor, sweeps: Sequence[int]) -> Tensor:
-        """The opacities [N] of splats in closed form, for these blend weights [N, P]; `whole` [N]: those of the base if nothing hid it."""
+    def matched(self, splats: Gaussians, wanted: Wanted, sweeps: Sequence[int]) -> Tensor:
+        """The opacities [N] of splats in closed form, for what is wanted of them."""
         problem, views = self._problem, self._views()
         finer = problem.scale / self._size
         target = replace(problem.target, eps2d=problem.target.eps2d / finer**2, settings=problem.target.settings.finer(1 / finer))
@@ -65,7 +65,7 @@ class Matcher:
             some = views[part::parts]
             return blend_weights(replace(splats, opacities=opacities), some, problem.backend, target) * (finer**2 * len(some) / len(views))
 
-        return matched_opacities(splats.opacities, weights, whole, weights_of, sweeps)
+        return matched_opacities(splats.opacities, wanted, weights_of, sweeps)
 
     @property
     def _size(self) -> float:

@@ -35,6 +35,19 @@ INVISIBLE_WEIGHT = 1e-4
 # of their opacities. A capture of which one side is shown keeps 1 dB more of the others by it.
 HARDLY_SEEN = 1e-3
 
+# px² of the base or the target, whichever has the larger pixels: a splat of a larger area looks alike with both filters. If its weight changes, that
+# is the doing of smaller splats before it, and to make up for it by its own opacity would show what it hides to views from elsewhere. So opacities
+# change the less the larger splats are beyond this (docs/recipes_found.md).
+WIDE = 16.0
+
+
+class Wanted(NamedTuple):
+    """What splats show in the base's images."""
+
+    weights: Tensor  # [N, P] pixels: what each of P parts of the views adds to the mean blend weight over all
+    whole: Tensor  # [N] pixels: the weights of splats that nothing hides (`blend_weights.whole_weights`)
+    areas: Tensor  # [N] px² of the base or the target, whichever has the larger pixels (`blend_weights.areas`)
+
 
 class Sweeps(NamedTuple):
     """How often all views are looked at, and in how many parts (1, 2 or 4) each time."""
@@ -55,21 +68,21 @@ def sweeps_over(views: Sequence[Camera]) -> Sweeps:
 
 @torch.no_grad()
 def matched_opacities(
-    opacities: Tensor, wanted: Tensor, whole: Tensor, weights_of: Callable[[Tensor, int, int], Tensor], sweeps: Sequence[int]
+    opacities: Tensor, wanted: Wanted, weights_of: Callable[[Tensor, int, int], Tensor], sweeps: Sequence[int]
 ) -> Tensor:
-    """Opacities [N] with which splats have the `wanted` blend weights [N, P], pixels: what each of P parts of the views adds to the mean over all.
+    """Opacities [N] with which splats have the `wanted` blend weights, as far as they are not `WIDE`.
 
-    `weights_of(opacities, part, parts)` [N]: the same with these opacities, of every `parts`-th view from number `part` on. `whole` [N]: the weights
-    of splats that nothing hides (`blend_weights.whole_weights`). `sweeps`: divisors of P.
+    `weights_of(opacities, part, parts)` [N]: the weights with these opacities, of every `parts`-th view from number `part` on. `sweeps`: divisors of
+    the number of parts.
     """
-    known, before = INVISIBLE_WEIGHT + HARDLY_SEEN * whole, None
-    mean = wanted.sum(1) + known
+    known, before = INVISIBLE_WEIGHT + HARDLY_SEEN * wanted.whole, None
+    mean, narrow = wanted.weights.sum(1) + known, WIDE / wanted.areas.clamp_min(WIDE)
     for parts in sweeps:
         for part in range(parts):
-            here = wanted[:, part::parts].sum(1) + known / parts
+            here = wanted.weights[:, part::parts].sum(1) + known / parts
             ratio = here / (weights_of(opacities, part, parts) + known / parts)
             overshot = torch.zeros_like(ratio, dtype=torch.bool) if before is None else (ratio > 1) != (before > 1)
             factor = torch.where(overshot, ratio.sqrt(), ratio)  # half of the way, as factors go: too far before, or other views say so
-            factor = factor ** (parts * here / mean).clamp_max(1)  # less of it where other parts show more of a splat
+            factor = factor ** (narrow * (parts * here / mean).clamp_max(1))  # less of it where other parts show more of a splat
             opacities, before = (opacities * factor.to(opacities).clamp(1 / MAX_FACTOR, MAX_FACTOR)).clamp_max(1), ratio
     return opacities

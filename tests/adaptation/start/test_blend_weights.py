@@ -11,7 +11,7 @@ from tiny import cameras, model
 
 from mipmap_plugin.adaptation.start import base_weights
 from mipmap_plugin.adaptation.start.base_weights import BaseWeights, weighed_in_parts
-from mipmap_plugin.adaptation.start.blend_weights import _color_gradient, blend_weights, may_show, weighed, whole_weights
+from mipmap_plugin.adaptation.start.blend_weights import _color_gradient, blend_weights, may_show, wanted_of, weighed, whole_weights
 from mipmap_plugin.adaptation.start.matching import PARTS
 from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.reference import ReferenceBackend
@@ -64,6 +64,14 @@ def test_the_whole_weight_is_that_of_a_splat_alone_in_the_middle_of_the_picture(
     assert whole.item() == pytest.approx(0.25 * 0.1 * 2 * math.pi * (9 + 0.3), rel=1e-5)
     shown = 0.25 * blend_weights(ball, [camera], ReferenceBackend(), Effects(0, settings=RenderSettings(min_alpha=1e-6)))
     assert shown.item() == pytest.approx(whole.item(), rel=0.01)
+
+
+@pytest.mark.parametrize(("scale", "shrunk"), [(1 / 2, 1 / 4), (2.0, 1.0)])
+def test_areas_are_in_the_larger_of_the_pixels_of_base_and_target(scale, shrunk):
+    """A ball of 3 px in the base."""
+    ball = Gaussians(torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 6.0), torch.tensor([0.1]), torch.zeros(1, 1, 3))
+    wanted = wanted_of(torch.ones(1, 4), ball, torch.tensor([2.0]), cameras(1), Effects(0), scale)
+    assert wanted.areas.item() == pytest.approx(shrunk * (9 + 0.3))
 
 
 def test_the_whole_weight_of_a_sky_is_the_picture():

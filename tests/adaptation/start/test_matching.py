@@ -1,8 +1,10 @@
 """Matching blend weights: exact for two splats of which one half hides the other, and harmless for the rest."""
 
 from dataclasses import replace
+from statistics import fmean
 from types import SimpleNamespace
 
+import discs
 import pytest
 import tiny
 import torch
@@ -12,11 +14,13 @@ from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.candidates import StartSearch
 from mipmap_plugin.adaptation.start.clock import Clock
 from mipmap_plugin.adaptation.start.matcher import UNMATCHED, Matcher
-from mipmap_plugin.adaptation.start.matching import MAX_FACTOR, PART_PIXELS, SWEEPS, matched_opacities, sweeps_over
+from mipmap_plugin.adaptation.start.matching import MAX_FACTOR, PART_PIXELS, SWEEPS, WIDE, Wanted, matched_opacities, sweeps_over
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
 
 VIEW = Camera(4, 3, 10.0, 10.0, 2.0, 1.5, torch.eye(4))
@@ -101,15 +105,40 @@ def test_opacities_change_after_each_part_of_the_views():
         tried.append((part, parts, *opacities.tolist()))
         return opacities / parts
 
-    new = matched_opacities(torch.tensor([0.2]), torch.tensor([[0.2, 0.2]]), NOTHING[:1], weights_of, (2,))
+    new = matched_opacities(torch.tensor([0.2]), Wanted(torch.tensor([[0.2, 0.2]]), NOTHING[:1], NOTHING[:1]), weights_of, (2,))
     assert tried == [(0, 2, pytest.approx(0.2)), (1, 2, pytest.approx(0.4, rel=1e-2))] and new.item() == pytest.approx(0.4, rel=1e-2)
 
 
 def test_a_part_that_shows_less_of_a_splat_than_the_others_moves_it_less():
     """It wants four times of what it sees, and has a tenth of what both parts want."""
     seen = torch.tensor([[0.025], [0.9]])
-    new = matched_opacities(torch.tensor([0.1]), torch.tensor([[0.1, 0.9]]), NOTHING[:1], lambda _, part, parts: seen[part], (2,))
+    wanted = Wanted(torch.tensor([[0.1, 0.9]]), NOTHING[:1], NOTHING[:1])
+    new = matched_opacities(torch.tensor([0.1]), wanted, lambda _, part, parts: seen[part], (2,))
     assert new.item() == pytest.approx(0.1 * 4 ** (2 * 0.1), rel=1e-2)
+
+
+@pytest.mark.parametrize(("area", "power"), [(WIDE / 2, 1.0), (WIDE, 1.0), (4 * WIDE, 1 / 4)])
+def test_the_opacity_of_a_splat_that_no_filter_changes_hardly_changes(area, power):
+    """It shows twice of what is wanted, as what lies before it has become thinner: to make it fainter would show what it hides."""
+    wanted = Wanted(torch.tensor([[0.4]]), NOTHING[:1], torch.tensor([area]))
+    new = matched_opacities(torch.tensor([0.8]), wanted, lambda *_: torch.tensor([0.8]), (1,))
+    assert new.item() == pytest.approx(0.8 * 0.5**power, rel=1e-3)
+
+
+def test_a_wall_behind_specks_that_become_thinner_stays_opaque():
+    """Or what it hides would show to whoever looks past the specks. It fills the picture, and each pixel of the base has a speck of 0.1 px."""
+    x, y = torch.meshgrid(torch.arange(-20.0, 21.0), torch.arange(-15.0, 16.0), indexing="xy")
+    specks = torch.stack([x.flatten() * discs.PIXEL, y.flatten() * discs.PIXEL, torch.full((x.numel(),), discs.DEPTH)], 1)
+    means = torch.cat([torch.tensor([[0.0, 0.0, 2 * discs.DEPTH]]), specks])
+    scales, opacities = means.new_full((len(means), 3), 0.1 * discs.PIXEL), means.new_full((len(means),), 0.8)
+    scales[0], opacities[0] = 800 * discs.PIXEL, 0.95
+    quats, sh = means.new_tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(len(means), 1), torch.zeros(len(means), 1, 3)
+    sh[0] = 1.5
+    cameras = [discs.VIEW, replace(discs.VIEW, name="again")]
+    model = VanillaModel.from_gaussians(Gaussians(means, quats, scales, opacities, sh), TrainedScale())
+    base = wrap_model(model, cameras=cameras, backend="reference")
+    wall, *thinned = base.adapt(1 / 4, recipe="instant", merge_to=1.0, extra_views=0).model.gaussians(discs.VIEW).opacities.tolist()
+    assert wall == pytest.approx(0.95, abs=0.01) and fmean(thinned) < 0.2
 
 
 @pytest.mark.parametrize(("views", "width", "parts"), [(24, 100, 4), (23, 100, 2), (12, 100, 2), (11, 100, 1), (24, 20, 1), (100, 20, 4)])
@@ -123,7 +152,7 @@ def test_parts_have_some_views_and_some_thousand_pixels(views, width, parts):
 def test_there_are_as_many_sweeps_as_splats_pixels_and_views_leave_time_for(time, count, sweeps):
     """Of the base 80 splats were weighed. At half of their size views take a quarter of the time at least, and 24 twice that of the first twelve."""
     problem = SimpleNamespace(base_effects=Effects(0), target=Effects(0, eps2d=0.2), has_blend_weights=True, scale=1 / 2)
-    seen = SimpleNamespace(views=24 * [VIEW], size=1.0, whole_of_base=torch.ones(80), notes=[])
+    seen = SimpleNamespace(views=24 * [VIEW], size=1.0, of_base=Wanted(*torch.ones(3, 80)), notes=[])
     clock = SimpleNamespace(allows=lambda work, amount: work == "weights" and amount <= time)
     assert Matcher(problem, clock, seen).sweeps_for(torch.ones(count, 4)) == sweeps
     assert seen.notes == ([] if sweeps else [UNMATCHED])
@@ -131,7 +160,7 @@ def test_there_are_as_many_sweeps_as_splats_pixels_and_views_leave_time_for(time
 
 def matched(opacities, wanted, whole, weigh, sweeps=WHOLE):
     """`matched_opacities` for views that are looked at all together."""
-    return matched_opacities(opacities, wanted[:, None], whole, lambda tried, part, parts: weigh(tried), sweeps)
+    return matched_opacities(opacities, Wanted(wanted[:, None], whole, torch.zeros_like(whole)), lambda tried, part, parts: weigh(tried), sweeps)
 
 
 @pytest.mark.parametrize("settings", [{}, {"most_splats": 20}], ids=["all splats", "merged ones"])
@@ -147,7 +176,7 @@ def test_without_steps_opacities_that_come_out_too_faint_are_matched_in_fewer_sw
     """None of these is drawn, which looks worse than with one sweep; with none they are the closed form's, which is not matched."""
     base, swept = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference"), []
 
-    def matched(opacities, wanted, whole, weights_of, sweeps):
+    def matched(opacities, wanted, weights_of, sweeps):
         swept.append(sweeps)
         return opacities * (factor if sweeps == WHOLE else 1)
 
