@@ -170,7 +170,7 @@ class Session:
     def _select(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str) -> Adapted:
         """Return the best of the states on views that did not steer the run, or the last where the settings say so."""
         allowed = [name for name, model in states.items() if len(model.parameters()["means"]) <= self._most_splats]
-        began, (base, start, *_), last = now(self.device), states, allowed[-1]
+        began, (base, start, *_), last, view = now(self.device), states, allowed[-1], self.views[0]
         with self.phase("validation"):
             best, psnrs, by_view, by_viewer = self.validation.choose(states, allowed)
         self.seconds["total"] += now(self.device) - began
@@ -179,11 +179,11 @@ class Session:
         elif self.detail is not None and psnrs[last] >= max(psnrs[name] for name in allowed if name in (base, start)) - HARM_DB:
             best = last  # a network adds detail that the base's own image does not have, so that its gain cannot be measured
         elif self.detail is None and self.wanted is None:
-            worse = worse_views(self.validation.choosing, by_view[base], by_view[best], self.scale, orbit=self._orbits)
+            means = means_at(self.base, view)
+            worse = worse_views(self.validation.choosing, by_view[base], by_view[best], self.scale, means, orbit=self._orbits)
             self.notes = [*self.notes, *worse, *worse_viewers(self.drawn.extremes, by_viewer[base], by_viewer[best])]
         note = "" if best == last else f": {psnrs[best]:.2f} dB on validation views, {last} {psnrs[last]:.2f} dB"
-        seconds, count = self.seconds["total"], count_of(states[last], self.views[0], self.scale)
-        at_end = CurvePoint(step=0, seconds=seconds, validation_db=psnrs[last], gaussians=count)
+        at_end = CurvePoint(step=0, seconds=self.seconds["total"], validation_db=psnrs[last], gaussians=count_of(states[last], view, self.scale))
         if not self.validation.choosing:
             note, psnrs = f", not validated: at this scale one pixel of the base is more than {WINDOW} px wide", {}
         report = self._report(states[best], curve or [at_end], ended_by, f"{best}{note}", psnrs)

@@ -7,13 +7,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import compress
 from pathlib import Path
-from statistics import fmean
+from statistics import fmean, median
 
 import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB
 from mipmap_plugin.adaptation.parallel import in_batches
+from mipmap_plugin.adaptation.pixel_size import seen_depth
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.errors import SettingsError, some_of
@@ -68,6 +69,9 @@ LONGER = 2.0
 
 # What to do about lenses that no single file fits.
 EACH_LENS = "adapt with the cameras of each lens on their own"
+
+# Views count as close-ups if the nearest tenth of their splats lies before this part of its depth in others, as a level is to the next coarser.
+NEAREST, CLOSE = 0.1, 0.5
 
 # What is said where most cameras see nothing.
 MISFIT = "; so many may be of another scene, or in other coordinates: give those of this one, unless it was cut down"
@@ -159,10 +163,13 @@ def too_unlike(views: Sequence[Camera]) -> str:
     return f"{where}; {EACH_LENS}"
 
 
-def worse_views(views: Sequence[Camera], before: Sequence[float], after: Sequence[float], scale: float, *, orbit: bool = False) -> list[str]:
+def worse_views(
+    views: Sequence[Camera], before: Sequence[float], after: Sequence[float], scale: float, means: Tensor, *, orbit: bool = False
+) -> list[str]:
     """That the file for `scale` shows some views worse than the base does, while it gains by their mean, in a sentence; none where it loses by that.
 
-    `before`, `after`: dB of each view as far as differences are visible. `orbit`: the views were generated, some of them finer, and have no lens.
+    `before`, `after`: dB of each view as far as differences are visible. `means` [N, 3]: of the base's splats. `orbit`: the views were generated,
+    some of them finer, and have no lens.
     """
     worse = [then > now + HARM_DB for then, now in zip(before, after, strict=True)]
     if not any(worse) or sum(after) < sum(before):
@@ -173,7 +180,17 @@ def worse_views(views: Sequence[Camera], before: Sequence[float], after: Sequenc
     shortest, longer = min(map(_focal, views)), min(map(_focal, compress(views, worse)))
     if longer >= LONGER * shortest and not orbit:
         told += f"; they are seen through longer lenses, of {longer:.0f} px and more, where the shortest has {shortest:.0f} px: {EACH_LENS}"
+    elif _are_close_ups(views, worse, means) and not orbit:
+        told += "; they are close-ups, and what looks right from afar does not from there: adapt with the cameras of close-ups on their own"
     return [told]
+
+
+def _are_close_ups(views: Sequence[Camera], some: Sequence[bool], means: Tensor) -> bool:
+    """Whether `some` of the views [V] see the nearest of the `means` [N, 3] from much nearer than the others (`CLOSE`)."""
+    points = means[:: 1 + len(means) // SAMPLES[1]]
+    depths = [seen_depth(view, points, 0.0, NEAREST) for view in views]
+    others = [depth for depth, close in zip(depths, some, strict=True) if not close]
+    return max(compress(depths, some)) < CLOSE * median(others)
 
 
 def _focal(view: Camera) -> float:

@@ -10,12 +10,18 @@ from mipmap_plugin import errors
 
 # Not a filter of Python's warnings, which all threads have in common.
 _silent: ContextVar[bool] = ContextVar("_silent", default=False)
+_held: ContextVar[list[str] | None] = ContextVar("_held", default=None)
 
 
 def warn(text: str) -> None:
-    """`errors.warn`, unless this is inside `silent`."""
-    if not _silent.get():
+    """`errors.warn`, unless this is inside `silent`; inside `held` it is kept."""
+    if _silent.get():
+        return
+    held = _held.get()
+    if held is None:
         errors.warn(text)
+    else:
+        held.append(text)
 
 
 @contextmanager
@@ -26,3 +32,18 @@ def silent() -> Iterator[None]:
         yield
     finally:
         _silent.reset(token)
+
+
+@contextmanager
+def held() -> Iterator[list[str]]:
+    """What adaptations of this thread warn of inside, for whoever knows whether what they make is kept. What ends in an exception warns of it."""
+    texts: list[str] = []
+    token = _held.set(texts)
+    try:
+        yield texts
+    except BaseException:
+        for text in texts:
+            errors.warn(text)
+        raise
+    finally:
+        _held.reset(token)

@@ -75,6 +75,7 @@ def evaluate(
     """
     page = evaluation_page_path(checkpoint[0], output) if report and checkpoint else None
     _refuse(checkpoint, images, cameras, [path for path in (output, page) if path], overwrite)
+    _refuse_unused(recipe, steps=steps, resize=resize)
     settings = without_none(seed=seed, steps=steps, upsampler=upsampler, resize=resize, viewer=viewer)
     results = _Results(protocol, _perceptual(lpips, lpips_weights), unique_scales(scale), page, output)
     with resumable(results.kept, "row"):
@@ -193,6 +194,12 @@ def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], cameras: Sequenc
     for output in outputs:
         refuse_output(output, overwrite, read, is_file=True)
         refuse_unwritable(output)
+
+
+def _refuse_unused(recipes: Sequence[str], **settings: Any) -> None:
+    for name, value in settings.items():
+        if value is not None and not recipes:
+            raise SettingsError(f"--{name} {value}: it is of adapted models, and none is evaluated; add --recipe default, or take --{name} away")
 
 
 def _title(checkpoint: Sequence[Path], images: Sequence[Path], protocol: str, judged: Sequence[int]) -> str:

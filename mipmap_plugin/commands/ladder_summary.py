@@ -16,6 +16,9 @@ from mipmap_plugin.formats.here import size_in_bytes
 # Viewers of three.js, for which a ladder's module is told of.
 OF_THREE_JS = ("spark", "three")
 
+# dB by which the base alone has to be better than a ladder for a line that says so.
+LOST = 0.5
+
 
 def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path] = (), json: bool = False) -> None:
     """Print a ladder's manifest, as JSON or in lines."""
@@ -32,8 +35,17 @@ def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path
     changed = f", at most {max(steps):.1f} lost or gained at a switch" if steps else ""
     ladder = f"at worst {manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} on average"
     lines.append(f"  {ladder}{changed}; the base alone: at worst {min(base):.1f} dB, {fmean(base):.1f} on average")
+    lines += _behind(manifest)
     lines.append(f"  {manifest['measured']}")
     say("\n".join([*lines, *(look_at(path) if path.name == PAGE else f"  {path}" for path in exports)]))
+
+
+def _behind(manifest: dict[str, Any]) -> list[str]:
+    """A line on where the base alone is clearly better than the ladder, if it is anywhere."""
+    lost = {point["zoom"]: point["base_db"] - point["psnr_db"] for point in manifest["curve"]}
+    zooms = [zoom for zoom, db in lost.items() if db > LOST]
+    where = " to ".join(dict.fromkeys(f"x{zoom:.3g}" for zoom in (max(zooms), min(zooms)))) if zooms else ""
+    return [f"  at {where} the base alone is better, by up to {max(lost.values()):.1f} dB"] if zooms else []
 
 
 def _below(manifest: dict[str, Any]) -> list[str]:

@@ -8,12 +8,13 @@ from one to the other.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.adaptation.start.problem import FinerLevel
+from mipmap_plugin.adaptation.warn import held, warn
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.contents import Contents, LeftOut, Level, Switch, ZoomPoint
@@ -22,7 +23,7 @@ from mipmap_plugin.levels.finished import Ladder
 from mipmap_plugin.levels.manifest import manifest
 from mipmap_plugin.levels.request import FINEST_RATIO, MOST_LOST, SAME, Band, LadderRequest
 from mipmap_plugin.levels.store import LevelStore
-from mipmap_plugin.levels.switching import EVEN, switching_zoom, zooms_between
+from mipmap_plugin.levels.switching import EVEN, SECOND_STEP, switching_zoom, zooms_between
 from mipmap_plugin.levels.yardstick import Yardstick
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.base import SplatModel, why_no_viewer
@@ -35,6 +36,10 @@ CURVE_STEP = 2**0.25
 
 # A level with more than this part of the finer one's splats costs a viewer as much. One with 1,987 of 1,996 was 1 dB worse, and below the base.
 FEWER = 0.9
+
+# A level that is shown from one zoom to another that is nearer than this, as a factor, is left out: a switch is not found more closely, and what
+# shows levels leaves one a little beyond its end (`levels.js` by 1.02).
+SLIVER = SECOND_STEP**2
 
 # Why a level is left out.
 NOT_BETTER = "adapting gave nothing better than the base as it is"
@@ -86,16 +91,19 @@ class _Work:
     request: LadderRequest
     store: LevelStore
     yardstick: Yardstick
+    said: list[str] = field(default_factory=list)  # what the level that was made last warned of
 
     def levels(self, band: Band) -> tuple[list[Level], list[LeftOut], float]:
         """The levels, those that are left out because they are no use as coarser ones, and the zoom down to which there was one made."""
         first = self._made("level_0", band, self.request.for_first(self.base, band))
+        self._tell()
         levels, left_out, ratio = [first], list[LeftOut](), band.ratio
         while not self._ends(levels[-1], band):
             level, ratio = self._next(levels[-1], band, len(levels) + len(left_out), ratio)
             band, reason = level.band, _no_use(level, levels[-1], self.yardstick)
             if reason is None:
                 levels.append(level)
+                self._tell()
             else:
                 left_out.append(LeftOut(band.scale, level.splats, reason))
         return levels, left_out, band.low
@@ -115,9 +123,17 @@ class _Work:
         """A level below a finer one. Where steps regained too little of what merging cost, it is made again, merged as the recipe allows."""
         level = self._made(name, band, arguments)
         merged_further = "start" in arguments and "merging_costs" not in self.request.settings
-        if not merged_further or _better(self.yardstick, finer, level, band.scale) <= MOST_LOST:
+        if not merged_further or not self._merged_too_far(finer, level):
             return level
         return self._made(f"{name}_merged_less", band, {**arguments, "merging_costs": recipe(self.request.recipe, band.scale).merging_costs})
+
+    def _merged_too_far(self, finer: Level, level: Level) -> bool:
+        """Whether a level is so much worse than the finer one at its own scale, or worse than that and than the base as the viewer draws it."""
+        zoom = level.band.scale
+        lost = _better(self.yardstick, finer, level, zoom)
+        if lost <= EVEN or lost > MOST_LOST:
+            return lost > MOST_LOST
+        return self.yardstick.psnr(level.adapted, zoom) < self.yardstick.psnr_of_base(self.request.viewer, zoom)
 
     def _ends(self, coarsest: Level, last: Band) -> bool:
         """Whether the ladder needs no level below its coarsest one, after the band that was the last to be adapted to."""
@@ -125,7 +141,15 @@ class _Work:
         return few or last.reaches(self.request.coarsest)
 
     def _made(self, name: str, band: Band, arguments: dict[str, Any]) -> Level:
-        return Level(self.store.level(name, lambda state: self.base.adapt(band.scale, resume=state, **arguments)), band)
+        with held() as said:
+            level = Level(self.store.level(name, lambda state: self.base.adapt(band.scale, resume=state, **arguments)), band)
+        self.said[:] = said
+        return level
+
+    def _tell(self) -> None:
+        """Warn of what the level that was made last warned of, now that it is kept."""
+        for text in self.said:
+            warn(text)
 
     def _suffices(self, level: Level) -> bool:
         """Whether a level is as good as requested at the ends of its band."""
@@ -146,14 +170,14 @@ def _no_use(level: Level, finer: Level, yardstick: Yardstick) -> str | None:
 
 
 def _shown(levels: list[Level], yardstick: Yardstick, end: float) -> tuple[list[Level], list[Switch], list[LeftOut]]:
-    """The levels that are shown at some zoom, the switches between them, and what is left out because its two switches are one.
+    """The levels that are shown at some zoom, the switches between them, and what is left out because its two switches are nearly one.
 
     `end`: the zoom at which the ladder ends.
     """
     left_out = list[LeftOut]()
     while True:
         switches = _switches(levels, yardstick, end)
-        number = next((number for number, (to, start) in enumerate(pairwise(switches), 1) if to.zoom <= start.zoom * SAME), None)
+        number = next((number for number, (to, start) in enumerate(pairwise(switches), 1) if to.zoom <= start.zoom * SLIVER), None)
         if number is None:
             return levels, switches, left_out
         unshown = levels[number]

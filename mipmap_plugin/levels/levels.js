@@ -1,4 +1,4 @@
-// Shows a ladder of levels in three.js: in each frame the level that fits how large a pixel is at the scene. It was written by mipmap_plugin
+// Shows a ladder of levels in three.js: in each frame the level that fits how large a pixel is at what is seen. It was written by mipmap_plugin
 // with levels.json and the level files, which lie beside it. With Spark:
 //
 //     scene.add(new SparkRenderer({ renderer })) // once a page: without it Spark draws nothing
@@ -14,7 +14,7 @@
 //       renderer.render(scene, camera)
 //     })
 
-import { Group, Vector2, Vector3 } from 'three'
+import { Group, Matrix4, Vector2, Vector3, Vector4 } from 'three'
 
 // A level stays until the zoom is so much beyond its switch, so that nothing flickers where a camera rests.
 const STAYS = 1.02
@@ -32,7 +32,7 @@ export class Levels extends Group {
     const manifest = await answer.json().catch(() => {
       throw new Error(`${answer.url} is no levels.json: give the folder of the ladder, as the server knows it`)
     })
-    if (!manifest.view_pixel) throw new Error(`${answer.url} is of a ladder by distance, or of an earlier version: make one by zoom (--by zoom)`)
+    if (!manifest.looked_at) throw new Error(`${answer.url} is of a ladder by distance, or of an earlier version: make one by zoom (--by zoom)`)
     const levels = new Levels(manifest, (file) => open(new URL(file, whole).href))
     await levels.opened(levels.wanted)
     return levels
@@ -62,15 +62,22 @@ export class Levels extends Group {
     this.drawn.forEach((splats, level) => splats && (splats.visible = level === this.shown))
   }
 
-  // How large the middle of the scene is on the canvas, over how large it was in training.
+  // How large what is in the picture is on the canvas, over how large it was in training: the median of splats that the views of the training looked
+  // at, and the middle of the scene where none of them is in the picture.
   zoom(camera, renderer, height = renderer.getDrawingBufferSize(new Vector2()).y) {
     this.updateWorldMatrix(true, false)
     camera.updateWorldMatrix(true, false)
-    const middle = new Vector3(...this.manifest.middle).applyMatrix4(this.matrixWorld)
+    const { looked_at, middle, view_pixel } = this.manifest
+    const toCamera = new Matrix4().multiplyMatrices(camera.matrixWorldInverse, this.matrixWorld)
+    const toCanvas = new Matrix4().multiplyMatrices(camera.projectionMatrix, toCamera)
     const projection = camera.projectionMatrix.elements // by columns: 5 is twice the focal length over the height, 15 is 1 without perspective
-    const distance = projection[15] === 1 ? 1 : middle.distanceTo(new Vector3().setFromMatrixPosition(camera.matrixWorld))
-    const pixel = (2 * distance) / (projection[5] * height)
-    return (this.manifest.view_pixel * new Vector3().setFromMatrixScale(this.matrixWorld).x) / pixel
+    const pixels = (new Vector3().setFromMatrixScale(toCamera).x * projection[5] * height) / 2 // of what is as long as it is far away
+    const zooms = looked_at.flatMap(([x, y, z, pixel]) => {
+      const { x: right, y: up, w: depth } = new Vector4(x, y, z, 1).applyMatrix4(toCanvas)
+      return depth > 0 && Math.abs(right) < depth && Math.abs(up) < depth ? [(pixel * pixels) / depth] : []
+    })
+    if (zooms.length) return zooms.sort((one, other) => one - other)[zooms.length >> 1]
+    return (view_pixel * pixels) / (projection[15] === 1 ? 1 : new Vector3(...middle).applyMatrix4(toCamera).length())
   }
 
   // The number of the level that is to be shown at a zoom: 0 is the finest.

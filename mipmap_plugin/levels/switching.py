@@ -22,8 +22,17 @@ def switching_zoom(low: float, high: float, measure: Callable[[float], tuple[flo
 
 
 def most_even(pairs: Sequence[tuple[float, float]]) -> int:
-    """Which of several pairs of dB differ least; of those that differ by at most `EVEN`, the one whose worse dB are best."""
-    return max(range(len(pairs)), key=lambda index: (-max(abs(pairs[index][0] - pairs[index][1]), EVEN), min(pairs[index])))
+    """Which of several pairs of dB, of the finer and of the coarser level at rising zooms, is the best for a switch.
+
+    The one that differs least; of those that differ by at most `EVEN`, the one whose worse dB are best. Where one level is better throughout, no
+    zoom is even, and nothing is gained by showing the other: the first, if that is the finer level, else the last.
+    """
+    better = [finer - coarser for finer, coarser in pairs]
+    if min(better) > EVEN:
+        return 0
+    if max(better) < -EVEN:
+        return len(pairs) - 1
+    return max(range(len(pairs)), key=lambda index: (-max(abs(better[index]), EVEN), min(pairs[index])))
 
 
 def zooms_between(low: float, high: float, step: float) -> list[float]:

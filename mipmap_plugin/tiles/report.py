@@ -56,7 +56,7 @@ def judged(scene: TiledScene) -> Judgment:
     if scene.config.returns == "best":
         best = last_of_best({name: each.visible for name, each in found.items()}, AS_IT_IS)
         before, after = ([Quality.of([[error]]).visible for error in errors[name]] for name in (AS_IT_IS, best))
-        worse = worse_views(views, before, after, scene.scale, orbit=not scene.wrapped.cameras)
+        worse = worse_views(views, before, after, scene.scale, scene.base.places[:, :3], orbit=not scene.wrapped.cameras)
     better = better_as_trained(as_trained, validation[best], scene.base_effects)
     return Judgment(validation, best, [*start["notes"], *worse, *better], as_trained)
 

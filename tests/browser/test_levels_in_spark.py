@@ -1,5 +1,6 @@
 """A ladder in a page of three.js, with Spark, by the module that lies beside its levels: which level it shows, and what that looks like."""
 
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -45,14 +46,30 @@ def page(browser: Browser, ladder: Path) -> Page:
     return browser.ladder(ladder)
 
 
+def zoom_of(ladder: Path, camera: Camera) -> float:
+    """The zoom that a camera sees the ladder at: the median of the splats in its picture."""
+    points = torch.tensor(read_manifest(ladder)["looked_at"], dtype=torch.float64)
+    seen = camera.to_camera(points[:, :3])
+    zooms = (points[:, 3] * camera.fy / seen[:, 2])[camera.in_picture(seen)].sort().values
+    return float(zooms[len(zooms) // 2])
+
+
 def seen_at(ladder: Path, zoom: float) -> Camera:
-    """A training view, from so far away that the ladder's middle is seen at this zoom."""
-    manifest, camera = read_manifest(ladder), embedded().cameras[0]
-    middle, rotation = torch.tensor(manifest["middle"], dtype=torch.float64), camera.viewmat[:3, :3]
-    away = -(rotation.T @ camera.viewmat[:3, 3]) - middle
-    viewmat = camera.viewmat.clone()
-    viewmat[:3, 3] = -(rotation @ (middle + away / away.norm() * camera.fy * manifest["view_pixel"] / zoom))
-    return replace(camera, viewmat=viewmat)
+    """A training view, from so far away from the ladder's middle that it sees the ladder at this zoom."""
+    middle, view = torch.tensor(read_manifest(ladder)["middle"], dtype=torch.float64), embedded().cameras[0]
+    rotation = view.viewmat[:3, :3]
+    away = -(rotation.T @ view.viewmat[:3, 3]) - middle
+
+    def walked(times: float) -> Camera:
+        viewmat = view.viewmat.clone()
+        viewmat[:3, 3] = -(rotation @ (middle + times * away))
+        return replace(view, viewmat=viewmat)
+
+    near, far = 0.2, 20.0
+    for _ in range(50):
+        half = math.sqrt(near * far)
+        near, far = (half, far) if zoom_of(ladder, walked(half)) > zoom else (near, half)
+    return walked(far)
 
 
 def test_levels_change_at_the_zooms_of_the_manifest(page: Page, ladder: Path) -> None:
@@ -72,12 +89,12 @@ def test_nothing_flickers_at_a_switch(page: Page, ladder: Path) -> None:
 
 def test_a_ladder_that_is_turned_and_enlarged_changes_where_it_looks_the_same(page: Page, ladder: Path) -> None:
     """A page twice as large, seen from twice as far away, is at the same zoom; upside down too."""
-    (middle, pixel), camera = (read_manifest(ladder)[key] for key in ("middle", "view_pixel")), embedded().cameras[0]
-    x, y, z = (2 * each for each in middle)
-    page.place((5.0, 0.0, 0.0), UPRIGHT, 2.0)
-    eye = torch.tensor([5.0 + x, -y, -z - 2 * camera.fy * pixel / 0.3], dtype=torch.float64)
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, 3] = -eye
+    place, turn = torch.tensor([5.0, 0.0, 0.0], dtype=torch.float64), torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    page.place(place.tolist(), UPRIGHT, 2.0)
+    camera = seen_at(ladder, 0.3)
+    viewmat = camera.viewmat.clone().double()
+    viewmat[:3, :3] = camera.viewmat[:3, :3].double() @ turn
+    viewmat[:3, 3] = -(viewmat[:3, :3] @ (place + 2 * turn @ camera.center.double()))
     page.draw([replace(camera, viewmat=viewmat)], WHITE)
     assert page.shown()[1] == pytest.approx(0.3, rel=1e-5)
 

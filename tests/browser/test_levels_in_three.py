@@ -16,12 +16,19 @@ pytestmark = pytest.mark.browser
 
 MIDDLE, BASE_PIXEL = [1.0, 2.0, 3.0], 0.1
 
+# x, y, z and the size of a pixel: at the middle, behind it, before it, and beside all pictures. From 10 units away, and from 30, and without
+# perspective, the median of the zooms of those in the picture is that of the middle.
+LOOKED_AT = [[*MIDDLE, BASE_PIXEL], [1.0, 2.0, -7.0, 4 * BASE_PIXEL], [1.0, 2.0, 8.0, BASE_PIXEL / 4], [41.0, 2.0, 3.0, 100 * BASE_PIXEL]]
+
 # The zoom from 10 units away, on a canvas 100 px high with a field of view of 60 degrees.
 PLAIN = BASE_PIXEL * 100 / (2 * 10 * math.tan(math.radians(30)))
 
 
-# Of each case, as a multiple of that zoom.
-ZOOMS = [("plain", 1), ("resized", 3), ("finer_pixels", 6), ("orthographic", 1), ("in_a_group", 1), ("camera_in_a_rig", 1), ("render_target", 1 / 2)]
+# Of each case, as a multiple of that zoom. Where a camera looks at nothing the distance of the middle counts, with `view_pixel`, half as large here.
+ZOOMS = [
+    ("plain", 1), ("resized", 3), ("finer_pixels", 6), ("orthographic", 1), ("in_a_group", 1), ("camera_in_a_rig", 1), ("render_target", 1 / 2),
+    ("turned_away", 1 / 2),
+]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +37,8 @@ def told(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> dict[str
     folder = tmp_path_factory.mktemp("ladder")
     shutil.copyfile(Path(manifest.__file__).with_name(THREE_JS), folder / THREE_JS)
     levels, switches = [{"file": f"level_{number}.ply"} for number in range(3)], [{"zoom": 0.5}, {"zoom": 0.2}]
-    (folder / MANIFEST).write_text(json.dumps({"middle": MIDDLE, "view_pixel": BASE_PIXEL, "levels": levels, "switches": switches}))
+    made = {"middle": MIDDLE, "view_pixel": BASE_PIXEL / 2, "looked_at": LOOKED_AT, "levels": levels, "switches": switches}
+    (folder / MANIFEST).write_text(json.dumps(made))
     (folder / "distance").mkdir()
     (folder / "distance" / MANIFEST).write_text(json.dumps({"by": "distance", "levels": levels}))
     (folder / "page").mkdir()

@@ -186,10 +186,15 @@ def test_evaluate_refuses_what_cannot_be_judged(run, model_folder, tmp_path):
     refused(run(*lpips, "--lpips", "alex"), f"{tmp_path} is a folder; give the file of the weights of alex in it")
 
 
-@pytest.mark.parametrize("setting", ["steps", "seed"])
-def test_evaluate_refuses_wrong_settings_that_no_recipe_is_there_to_use(run, model_folder, tmp_path, setting):
-    words = ["evaluate", model_folder, "--images", tiny.scene(tmp_path / "scene"), "--scale", "1/2", f"--{setting}", "-1"]
-    refused(run(*words), f"setting {setting}: must be a whole number", "got -1")
+def test_evaluate_refuses_a_wrong_seed_that_no_recipe_is_there_to_use(run, model_folder, tmp_path):
+    words = ["evaluate", model_folder, "--images", tiny.scene(tmp_path / "scene"), "--scale", "1/2", "--seed", "-1"]
+    refused(run(*words), "setting seed: must be a whole number", "got -1")
+
+
+@pytest.mark.parametrize("setting, value", [("steps", "20"), ("steps", "-1"), ("resize", "area")])
+def test_evaluate_refuses_settings_of_adapted_models_where_nothing_is_adapted(run, model_folder, tmp_path, setting, value):
+    words = ["evaluate", model_folder, "--images", tiny.scene(tmp_path / "scene"), "--scale", "1/2", f"--{setting}", value]
+    refused(run(*words), f"--{setting} {value}: it is of adapted models, and none is evaluated; add --recipe default")
 
 
 def test_a_checkpoint_of_which_nothing_is_drawn_is_refused_before_the_work(run, tmp_path):

@@ -9,15 +9,18 @@ import anchor_checkpoints
 import moving
 import pytest
 import tiny
+import torch
 from brief_levels import BRIEF, request, wrapped
 
 from mipmap_plugin import cli, load_model, wrap_model
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report
+from mipmap_plugin.adaptation.warn import held, warn
 from mipmap_plugin.commands.ladder_summary import print_summary
 from mipmap_plugin.errors import OutputExists, SettingsError
+from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.contents import LeftOut, Level
 from mipmap_plugin.levels.ladder import NO_FEWER, NOT_BETTER, UNSHOWN, _no_use, _shown, _Work, make_levels
-from mipmap_plugin.levels.manifest import MANIFEST, THREE_JS, base_pixel, read_manifest, refuse_ladder, view_pixel
+from mipmap_plugin.levels.manifest import MANIFEST, THREE_JS, TOLD, base_pixel, looked_at, read_manifest, refuse_ladder, view_pixel
 from mipmap_plugin.levels.request import MERGING_COSTS, Band
 from mipmap_plugin.models.places import state_path
 from mipmap_plugin.models.vanilla import VanillaModel
@@ -49,6 +52,27 @@ def test_a_level_that_is_the_base_again_is_left_out(tmp_path, monkeypatch, capsy
     assert f"no level of its own at x0.5, where a neighbor is shown: {NOT_BETTER}" in capsys.readouterr().out
 
 
+def test_only_of_levels_that_are_kept_is_anything_warned(monkeypatch, recwarn):
+    base, adapt = wrapped(), FrozenBase.adapt
+
+    def warning(self, scale, **options):
+        warn(f"x{scale:g} looks worse")
+        return adapt(self, scale, **options)
+
+    monkeypatch.setattr(FrozenBase, "adapt", warning)
+    monkeypatch.setattr("mipmap_plugin.levels.ladder._no_use", lambda level, *_: NO_FEWER if 0.4 < level.band.scale < 0.6 else None)
+    ladder = make_levels(base, request())
+    assert [left.scale for left in ladder.contents.left_out] == pytest.approx([1 / 2])
+    assert [str(each.message) for each in recwarn if "looks worse" in str(each.message)] == ["x1 looks worse", "x0.25 looks worse"]
+
+
+def test_what_a_level_that_fails_warned_of_is_told(recwarn):
+    with pytest.raises(SettingsError), held():
+        warn("the cameras may be of another scene")
+        raise SettingsError("nothing is drawn")
+    assert [str(each.message) for each in recwarn] == ["the cameras may be of another scene"]
+
+
 @pytest.mark.parametrize(
     ("returned", "splats", "psnr", "reason"),
     [
@@ -62,14 +86,14 @@ def test_a_coarser_level_has_clearly_fewer_splats_than_the_finer_one_or_is_bette
     assert _no_use(level, finer, SimpleNamespace(psnr=lambda each, _: each.psnr)) == reason
 
 
-@pytest.mark.parametrize(("psnr", "splats"), [(27.5, 2), (26.5, 8)])
-def test_a_level_whose_steps_regain_too_little_of_what_merging_cost_is_made_again(monkeypatch, psnr, splats):
-    """It may be 3 dB worse than the finer level, whose PSNR is 30 dB."""
+@pytest.mark.parametrize(("psnr", "base", "splats"), [(27.5, 20, 2), (26.5, 20, 8), (27.5, 28, 8), (29.6, 29.8, 2)])
+def test_a_level_whose_steps_regain_too_little_of_what_merging_cost_is_made_again(monkeypatch, psnr, base, splats):
+    """It may be 3 dB worse than the finer level, whose PSNR is 30 dB, but not worse than the base, unless it is as good as the finer level."""
     monkeypatch.setattr("mipmap_plugin.levels.ladder.MOST_LOST", 3.0)
     few, many = (SimpleNamespace(psnr=db, model=tiny.model(n)) for db, n in ((psnr, 2), (29, 8)))
-    base = SimpleNamespace(adapt=lambda scale, *, merging_costs, **_: few if merging_costs == MERGING_COSTS else many)
-    yardstick = SimpleNamespace(psnr=lambda each, _: each.psnr)
-    work = _Work(base, request(), SimpleNamespace(level=lambda name, make: make(None)), yardstick)
+    frozen = SimpleNamespace(adapt=lambda scale, *, merging_costs, **_: few if merging_costs == MERGING_COSTS else many)
+    yardstick = SimpleNamespace(psnr=lambda each, _: each.psnr, psnr_of_base=lambda *_: base)
+    work = _Work(frozen, request(), SimpleNamespace(level=lambda name, make: make(None)), yardstick)
     made, _ = work._next(Level(SimpleNamespace(psnr=30, model=tiny.model(9)), BAND), BAND, 1, 2.0)
     assert made.splats == splats
 
@@ -82,6 +106,16 @@ def test_a_level_that_is_shown_at_no_zoom_is_left_out():
     shown, switches, left_out = _shown(levels, yardstick, 0.1)
     assert shown == [levels[0], levels[2]] and len(switches) == 1 and 0.25 < switches[0].zoom < 1
     assert left_out == [LeftOut(0.5, 2, UNSHOWN)]
+
+
+@pytest.mark.parametrize(("ends", "kept"), [(0.46, 2), (0.4, 3)])
+def test_a_level_that_is_hardly_shown_is_left_out(ends, kept):
+    """Level 1 is as good as level 0 at x0.47, and as level 2 where it `ends`."""
+    levels = [Level(SimpleNamespace(number=n, model=tiny.model(3 - n)), Band(0.55**n, 0.7 * 0.55**n, 1, 2)) for n in range(3)]
+    dbs = [lambda zoom: 30 + 400 * math.log2(zoom / 0.47), lambda _: 30, lambda zoom: 30 - 400 * math.log2(zoom / ends)]
+    yardstick = SimpleNamespace(psnr=lambda level, zoom: dbs[level.number](zoom), likeness=lambda *_: 30)
+    shown, switches, left_out = _shown(levels, yardstick, 0.1)
+    assert len(shown) == kept == len(switches) + 1 == 3 - len(left_out)
 
 
 def test_a_level_is_not_shown_where_a_coarser_one_is_better(monkeypatch):
@@ -153,6 +187,20 @@ def test_the_views_of_the_training_are_at_x1_by_what_they_look_at():
     assert view_pixel(wrap_model(VanillaModel.from_gaussians(ball), cameras=views)) == pytest.approx(away / views[0].fx, rel=0.05)
 
 
+def test_a_page_sees_the_views_of_the_training_at_x1_also_where_these_look_past_the_middle():
+    """Most of what each shows lies three times as far away as the middle of all splats, and one shows nothing."""
+    views, ball = tiny.cameras(3), tiny.gaussians(200, spread=0.3)
+    away = ball.means.median(0).values - torch.stack([view.center.float() for view in views]).mean(0)
+    scene = replace(tiny.gaussians(300, spread=0.3, seed=2), means=tiny.gaussians(300, spread=0.3, seed=2).means + 2 * away).joined(ball)
+    blind = replace(views[0], viewmat=torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])).to(views[0].viewmat) @ views[0].viewmat)
+    told = torch.tensor(looked_at(wrap_model(VanillaModel.from_gaussians(scene), cameras=[*views, blind])), dtype=torch.float64)
+    assert TOLD / 2 < len(told) <= TOLD + 4
+    for view in views:
+        points = view.to_camera(told[:, :3])
+        zooms = (told[:, 3] * view.fx / points[:, 2])[view.in_picture(points)]
+        assert float(zooms.median()) == pytest.approx(1, rel=0.1)
+
+
 def test_a_ladder_is_saved_when_its_base_is_gone(tmp_path):
     base = tiny.ply(tmp_path / "base.ply", degree=0)
     ladder = wrap_model(base, cameras=tiny.cameras(2, width=16, height=12)).levels("classic", coarsest=1.0)
@@ -212,6 +260,17 @@ def test_what_no_viewer_draws_has_no_levels(tmp_path, write, by):
     base = wrap_model(tmp_path / "base", cameras=tiny.cameras(2))
     with pytest.raises(SettingsError, match="levels are files for viewers, so adapt it to one scale at a time"):
         make_levels(base, request("supersplat", by=by))
+
+
+@pytest.mark.parametrize(
+    ("lost", "told"),
+    [((-2, 0.4, 0.5), ""), ((1, 0.9, 0.2), "at x1 to x0.5 the base alone is better, by up to 1.0 dB"), ((0, 0, 2.6), "at x0.25 the")],
+)
+def test_it_is_told_where_the_base_alone_is_better(tmp_path, capsys, lost, told):
+    curve = [{"zoom": 0.5**number, "psnr_db": 30.0, "base_db": 30.0 + db} for number, db in enumerate(lost)]
+    print_summary(tmp_path, {"viewer": "spark", "levels": [], "switches": [], "curve": curve, "worst_db": 30, "mean_db": 30, "measured": ""})
+    said = capsys.readouterr().out
+    assert told in said if told else "better" not in said
 
 
 def test_no_level_advises_to_leave_out_the_viewer_that_a_ladder_needs(monkeypatch, recwarn):

@@ -1,6 +1,7 @@
 """Ladders by distance: which levels they keep, what is saved of them, and the command."""
 
 import json
+import weakref
 from contextlib import nullcontext
 
 import pytest
@@ -89,6 +90,21 @@ def test_a_level_that_no_step_betters_is_not_merged_at_any_cost(small_chunks, mo
     assert told == name
     if name == AS_FINER:
         assert torch.equal(student.parameters()["means"], first.parameters()["means"])
+
+
+def test_a_level_keeps_no_pictures_when_it_is_made(small_chunks, monkeypatch):
+    """They take gigabytes, and those of all levels filled the memory of a small machine."""
+    runs, others = [], []
+
+    class Noted(LevelRun):
+        def __post_init__(self):
+            others.append(sum(run() is not None for run in runs))
+            runs.append(weakref.ref(self))
+            super().__post_init__()
+
+    monkeypatch.setattr("mipmap_plugin.levels.distance.ladder.LevelRun", Noted)
+    wrapped().levels("classic", by="distance", coarsest=1 / 4, ratio=2.0, **BRIEF)
+    assert others == [0, 0]
 
 
 def test_what_takes_long_is_announced(small_chunks, monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -48,13 +49,19 @@ def make_levels_by_distance(base: FrozenBase, request: LadderRequest, resume: Pa
     with threads.limited_for(scene.backend, base.threads):
         levels = [first]
         for number in range(1, scene.rule.count):
-            with announced(f"level {number}: choosing views"):
-                run = LevelRun(scene, number, [level.model for level in levels])
-            levels.append(store.level(f"level_{number}", run.run))
+            levels.append(_level_below(scene, number, levels, store))
+            gc.collect()  # a run and its own functions hold one another, and gigabytes of pictures, until somebody looks for such circles
         scene, levels, left_out = without_repeats(scene, levels)
         with announced("measuring the levels"):
             curve = measured(scene, [level.model for level in levels])
     return Ladder(DistanceContents(scene, levels, curve, left_out), store, manifest)
+
+
+def _level_below(scene: DistanceScene, number: int, finer: list[Adapted], store: LevelStore) -> Adapted:
+    """The `number`-th level, below all finer ones."""
+    with announced(f"level {number}: choosing views"):
+        run = LevelRun(scene, number, [level.model for level in finer])
+    return store.level(f"level_{number}", run.run)
 
 
 def without_repeats(scene: DistanceScene, levels: list[Adapted]) -> tuple[DistanceScene, list[Adapted], list[LeftOut]]:

@@ -1,5 +1,6 @@
 """Views that show nothing, little or what is too near are refused or told of."""
 
+import math
 import re
 from dataclasses import replace
 
@@ -8,9 +9,13 @@ import tiny
 import torch
 from brief_runs import is_finite, shrunk
 
+from mipmap_plugin.adaptation import shown
 from mipmap_plugin.adaptation.shown import far_apart, remarks, worse_views
+from mipmap_plugin.camera import Camera, viewmat_of
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.wrap import wrap_model
+
+MEANS = torch.zeros(1, 3)  # of a splat in the middle of all views
 
 
 def test_a_bare_file_without_cameras_adapts_on_an_orbit(tmp_path):
@@ -43,7 +48,7 @@ def test_lenses_that_differ_too_much_are_told_of(times, recwarn):
 def test_views_that_lose_while_the_others_gain_are_told_of_with_their_lenses():
     """Two of four lose, both through lenses of three times the focal length."""
     views = [replace(view, fx=times * view.fx, fy=times * view.fy) for view, times in zip(tiny.cameras(4), (1, 3, 1, 3), strict=True)]
-    [told] = worse_views(views, [20.0, 36.0, 20.0, 30.0], [30.0, 28.0, 30.0, 29.0], 1 / 4)
+    [told] = worse_views(views, [20.0, 36.0, 20.0, 30.0], [30.0, 28.0, 30.0, 29.0], 1 / 4, MEANS)
     assert told.startswith("in 2 of 4 views that it was chosen by, the file for x0.25 looks worse than the base, by up to 8.0 dB")
     assert f"of {3 * views[0].fx:.0f} px and more, where the shortest has {views[0].fx:.0f} px: adapt with the cameras of each lens" in told
 
@@ -56,25 +61,43 @@ def test_the_report_tells_of_longer_lenses_that_the_file_suits_less_than_the_bas
 
 
 def test_lenses_are_not_blamed_where_the_views_that_lose_have_the_same():
-    [told] = worse_views(tiny.cameras(2), [20.0, 36.0], [30.0, 28.0], 1 / 4)
+    [told] = worse_views(tiny.cameras(2), [20.0, 36.0], [30.0, 28.0], 1 / 4, MEANS)
     assert told.endswith("(36.0 -> 28.0), though it gains by their mean")
+
+
+@pytest.mark.parametrize("depth, told_of", [(3.0, True), (6.0, False)])
+def test_views_that_lose_are_called_close_ups_where_they_are_less_than_half_as_far(depth, told_of):
+    """The nearest tenth of the splats tells, not what lies behind."""
+    means = torch.tensor([[0.0, 0.0, 10.0]] * 2 + [[0.0, 0.0, 1000.0]] * 15)
+    far, near = (Camera(32, 24, 40.0, 40.0, 16.0, 12.0, viewmat_of(torch.eye(3), torch.tensor([0.0, 0.0, 10.0 - away]))) for away in (10.0, depth))
+    [told] = worse_views([far, near, far], [20.0, 36.0, 20.0], [30.0, 28.0, 30.0], 1 / 4, means)
+    assert ("; they are close-ups, and what looks right from afar does not from there: adapt with the cameras of close-ups" in told) is told_of
+
+
+def test_the_report_tells_of_close_ups_that_the_file_suits_less_than_the_base(monkeypatch):
+    """As of longer lenses, which show the same in as many pixels."""
+    monkeypatch.setattr(shown, "LONGER", math.inf)
+    monkeypatch.setattr(shown, "CLOSE", 2.0)
+    views = [replace(view, fx=times * view.fx, fy=times * view.fy) for view, times in zip(tiny.cameras(8), (1, 8) * 4, strict=True)]
+    with pytest.warns(UserWarning, match="the file for x0.25 looks worse than the base.* close-ups"):
+        wrap_model(tiny.model(20), cameras=views).adapt(1 / 4, recipe="instant")
 
 
 def test_the_zooms_of_a_band_are_no_lenses():
     """All views of a level have the same lens, and lie at different zooms."""
-    [told] = worse_views([view.zoomed(zoom) for view, zoom in zip(tiny.cameras(2), (0.5, 2), strict=True)], [20.0, 36.0], [30.0, 28.0], 1 / 4)
+    [told] = worse_views([view.zoomed(zoom) for view, zoom in zip(tiny.cameras(2), (0.5, 2), strict=True)], [20.0, 36.0], [30.0, 28.0], 1 / 4, MEANS)
     assert told.endswith("though it gains by their mean")
 
 
 def test_generated_views_have_no_lens_that_could_be_to_blame():
     """A fifth of them are finer on purpose."""
     views = [replace(view, fx=view.fx * longer, fy=view.fy * longer) for view, longer in zip(tiny.cameras(2), (1, 2), strict=True)]
-    assert ["lenses" in worse_views(views, [20.0, 36.0], [30.0, 28.0], 1 / 4, orbit=orbit)[0] for orbit in (False, True)] == [True, False]
+    assert ["lenses" in worse_views(views, [20.0, 36.0], [30.0, 28.0], 1 / 4, MEANS, orbit=orbit)[0] for orbit in (False, True)] == [True, False]
 
 
 @pytest.mark.parametrize("after", [[21.0, 36.0], [20.0, 35.95], [21.0, 30.0]])
 def test_nothing_is_told_of_views_where_none_loses_or_their_mean_does(after):
-    assert worse_views(tiny.cameras(2), [20.0, 36.0], after, 1 / 4) == []
+    assert worse_views(tiny.cameras(2), [20.0, 36.0], after, 1 / 4, MEANS) == []
 
 
 def moved_away(times, **size):

@@ -44,6 +44,9 @@ export async function start() {
     rig.remove(camera)
     camera.position.set(x, y, z + 10)
     found.render_target = levels.zoom(camera, renderer, 50)
+    camera.rotation.y = Math.PI
+    found.turned_away = levels.zoom(camera, renderer)
+    camera.rotation.y = 0
     return found
   }
 
