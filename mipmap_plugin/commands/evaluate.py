@@ -75,8 +75,7 @@ def evaluate(
     """
     page = evaluation_page_path(checkpoint[0], output) if report and checkpoint else None
     _refuse(checkpoint, images, cameras, [path for path in (output, page) if path], overwrite)
-    _refuse_unused(recipe, steps=steps, resize=resize)
-    settings = without_none(seed=seed, steps=steps, upsampler=upsampler, resize=resize, viewer=viewer)
+    settings = without_none(seed=seed, upsampler=upsampler, viewer=viewer) | _of_adapted(recipe, steps=steps, resize=resize)
     results = _Results(protocol, _perceptual(lpips, lpips_weights), unique_scales(scale), page, output)
     with resumable(results.kept, "row"):
         for name, path, folder, own in zip(_names(checkpoint, images), checkpoint, images, cameras or [None] * len(checkpoint), strict=True):
@@ -196,10 +195,13 @@ def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], cameras: Sequenc
         refuse_unwritable(output)
 
 
-def _refuse_unused(recipes: Sequence[str], **settings: Any) -> None:
-    for name, value in settings.items():
-        if value is not None and not recipes:
+def _of_adapted(recipes: Sequence[str], **settings: Any) -> dict[str, Any]:
+    """Those of the settings of adapted models that are given. Raises SettingsError if nothing is adapted."""
+    given = without_none(**settings)
+    for name, value in given.items():
+        if not recipes:
             raise SettingsError(f"--{name} {value}: it is of adapted models, and none is evaluated; add --recipe default, or take --{name} away")
+    return given
 
 
 def _title(checkpoint: Sequence[Path], images: Sequence[Path], protocol: str, judged: Sequence[int]) -> str:
