@@ -212,6 +212,9 @@ def _sized(path: Path, header: Header, size: int) -> Header:
     if not vertices and header.elements and header.elements[0].name == "vertex_0":
         by_degree = "has an element of splats for each SH degree (vertex_0, ...), as Reduced-3DGS writes them, which is not read here"
         raise CheckpointError(f"{path} {by_degree}; give the PLY of another training of 3DGS")
+    if not vertices and (objects := [element.name for element in header.elements if "opacity" in element.names]):
+        by_object = f"has an element of splats for each object ({', '.join(objects[:2])}, ...), as Street Gaussians writes them, which move"
+        raise CheckpointError(f"{path} {by_object}; that is not read here; give the PLY of a training of 3DGS")
     if not vertices:
         raise CheckpointError(f"{path} has no vertex element, so it holds no splats; its elements are {[e.name for e in header.elements]}")
     vertex = vertices[0]

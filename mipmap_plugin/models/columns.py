@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,9 @@ CODES = ("i1", "u1", "i2", "u2")
 
 # Floats above this are no colors in 0..1, not even of lights.
 BRIGHTEST = 16
+
+# Of more numbered columns than this, only the first and the last are named.
+LISTED = 4
 
 # Rows that are transposed together: 1 to 2 MB of a file, which stay in the cache while columns are copied.
 CHUNK = 8192
@@ -46,7 +50,11 @@ def to_parameters(columns: Mapping[str, np.ndarray], path: Path) -> dict[str, Te
     Raises CheckpointError for missing columns, for codes in place of values, and for a number of f_rest columns that fits no SH degree.
     """
     columns = _with_logits(_with_dc(_with_halves(columns)))
-    if missing := [name for name in NEEDED if name not in columns]:
+    missing = [name for name in NEEDED if name not in columns]
+    if missing == [*DC]:
+        elsewhere = "its project keeps them in another file, such as a network, which is not read here"
+        raise CheckpointError(f"{path} holds splats without colors (f_dc_0, f_dc_1, f_dc_2): {elsewhere}; give a training of 3DGS")
+    if missing:
         raise CheckpointError(f"{path} is no 3DGS checkpoint: it lacks the columns {', '.join(missing)}; export it again with them")
     rest = rest_names(columns)
     if codes := [name for name in (*DC, *rest, *SCALE, *QUATERNION) if columns[name].dtype.str[1:] in CODES]:
@@ -104,11 +112,20 @@ def extra_names(columns: Mapping[str, np.ndarray]) -> list[str]:
 def notes_on(extras: Mapping[str, np.ndarray]) -> list[str]:
     """What is said of extra columns, in sentences; `filter_3D` has its family's own."""
     names = [name for name in extras if name != FILTER_3D]
-    notes = [f"extra columns are carried along: {', '.join(names)}"] if names else []
+    notes = [f"extra columns are carried along: {in_short(names)}"] if names else []
     if all(name in extras and (extras[name] == value).all() for name, value in zip(NORMAL, GRUT_NORMAL, strict=True)):
         kernel = "whose particles are Gaussians only of degree 2, which is not its default"
         notes.append(f"its normals are those that 3DGRUT, MetalSplatter and wgpu-3dgs write: if 3DGRT trained it, {kernel}, it is drawn otherwise")
     return notes
+
+
+def in_short(names: Iterable[str]) -> str:
+    """Names of columns in words, of many that are numbered the first and the last: "segment, semantic_0 to semantic_511"."""
+    words = []
+    for prefix, group in groupby(names, lambda name: re.sub(r"\d+$", "", name)):
+        some = list(group)
+        words += [f"{some[0]} to {some[-1]}"] if prefix.endswith("_") and len(some) > LISTED else some
+    return ", ".join(words)
 
 
 def notes_on_types(columns: Mapping[str, np.ndarray]) -> list[str]:

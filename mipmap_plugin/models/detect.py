@@ -11,7 +11,7 @@ from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import OF_SPLATS, Family, Files, Match
-from mipmap_plugin.models.folders import checkpoints_in, holds_points, is_model_folder, meant_instead, model_folders_below
+from mipmap_plugin.models.folders import checkpoints_in, holds_points, is_model_folder, meant_instead, model_folders_below, splats_in
 from mipmap_plugin.models.others import OTHERS, UNREAD
 from mipmap_plugin.models.places import PARTS, has_report
 from mipmap_plugin.models.zipped_folder import retold, unzipped, with_archives_named
@@ -183,10 +183,8 @@ def _detect_iteration(folder: Path, wanted: int | None) -> Checkpoint:
         raise CheckpointError(f"{folder / 'point_cloud'} has no iteration_{wanted}; it has {', '.join(map(str, sorted(entries)))}")
     troubles: list[str] = []
     for number in [wanted] if wanted is not None else sorted(entries, reverse=True):
-        ply = entries[number] / "point_cloud.ply"
         try:
-            if not ply.exists() and (scene := ply.with_name("scene_point_cloud.ply")).exists():
-                raise CheckpointError(f"{entries[number]} is of SAGA; give the PLY of its scene itself: {scene}")
+            ply = splats_in(entries[number])
             checkpoint, match = _recognize(settled(ply))
             if match.lacks:
                 raise CheckpointError(f"{entries[number]} is an incomplete checkpoint, without {', '.join(match.lacks)}")

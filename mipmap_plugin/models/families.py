@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
-from typing import Any
 
 from mipmap_plugin.errors import PluginError, with_article
 from mipmap_plugin.formats.splat_transform import EXCHANGE
@@ -13,20 +11,10 @@ from mipmap_plugin.formats.zipped import only_ply
 from mipmap_plugin.models.anchors.companions import missing_networks
 from mipmap_plugin.models.family import API_VERSION, BY_COMPANIONS, CERTAIN, PLAIN, Family, Files, Match
 from mipmap_plugin.models.places import GSPLAT, NETWORKS, SPLATFACTO, is_coarse, network_of
+from mipmap_plugin.models.refusals import ANCHOR_COLUMNS, FILTERED, FLAT_OR_FILTERED, OF_MORE_COLUMNS, REFUSED, family
 from mipmap_plugin.registry import Registry
 
 Recognize = Callable[[Files], Match | None]
-
-# Names that only the optimizer of fudan-zvg's 4D Gaussian Splatting has; that project saves no PLY.
-FUDAN = ("scaling_t", "rotation_r")
-
-# Names of parameters in the checkpoints of nv-tlabs/3dgrut.
-GRUT = ("features_albedo", "density")
-
-ANCHOR_COLUMNS = {"f_offset_0", "f_anchor_feat_0"}
-FILTERED = ("mip", "gof", "analytic")
-FLAT_OR_FILTERED = (*FILTERED, "2dgs")
-OF_MORE_COLUMNS = ("sc-gs", *FLAT_OR_FILTERED)
 
 
 def where(test: Callable[[Files], object], why: str, *, sure: float = CERTAIN) -> Recognize:
@@ -111,14 +99,7 @@ def _lost_network(files: Files, family: str) -> Match | None:
     return Match(BY_COMPANIONS, "networks of other iterations", trouble)
 
 
-family = partial(Family, api_version=API_VERSION)
 LOADERS = "mipmap_plugin.models"
-
-
-def refused(name: str, title: str, test: Callable[[Files], object], why: str, trouble: str, *, sure: float = CERTAIN, **facts: Any) -> Family:
-    """A family whose files, which pass `test`, are refused in a sentence: their path and `trouble`. `facts`: further ones of `Family`."""
-    return family(name, title, lambda files: Match(sure, why, f"{files.path} {trouble}") if test(files) else None, **facts)
-
 
 BUILT_IN = (
     family(
@@ -164,46 +145,7 @@ BUILT_IN = (
     ),
     family("spacetime", "SpacetimeGaussians", where(lambda files: "trbf_center" in files.columns, "columns trbf_center"), before=OF_MORE_COLUMNS),
     family("sc-gs", "SC-GS", controlled, before=FLAT_OR_FILTERED),
-    refused(
-        "many-scales", "another model", lambda files: "scale_3" in files.columns and not ANCHOR_COLUMNS & files.columns, "column scale_3",
-        "has the column scale_3, which no splats have: it holds anchors or another model; give what it exports",
-        before=("spacetime", *OF_MORE_COLUMNS),
-    ),
-    refused(
-        "3d-hgs", "3D-HGS", lambda files: {"opacity1", "opacity2"} <= files.columns, "columns opacity1, opacity2",
-        "holds half-Gaussians (3D-HGS), whose two halves have opacities of their own, which are not read here",
-        before=("many-scales", "spacetime", *OF_MORE_COLUMNS),
-    ),
-    refused(
-        "saga", "SAGA", lambda files: {"f_0", "opacity"} <= files.columns and "f_dc_0" not in files.columns, "features without colors",
-        "holds features without colors (SAGA); give the scene_point_cloud.ply of its training",
-        before=("spacetime", *OF_MORE_COLUMNS),
-    ),
-    refused(
-        "gsplat-png", "gsplat's PngCompression", lambda files: files.kind == "gsplat-png", "a meta.json of pictures",
-        "lists the pictures of gsplat's PngCompression, which are quantized; give the ckpts/ckpt_*.pt that they were made from",
-        place=("", r"meta\.json"),
-    ),
-    refused(
-        "beta", "Deformable Beta Splatting", lambda files: {"beta", "sh0_0"} <= files.columns, "columns beta, sh0_0",
-        "is of Deformable Beta Splatting, whose kernels are no Gaussians, which is not read here",
-    ),
-    refused(
-        "3dgrut", "3DGRUT", lambda files: files.words(*GRUT) == set(GRUT), "its parameters' names",
-        "is of 3DGRUT, whose checkpoints are not read here; give the PLY that it exports (export_ply.enabled=true)",
-    ),
-    refused(
-        "fudan", "4D Gaussian Splatting (fudan-zvg)", lambda files: files.words(*FUDAN) == set(FUDAN), "its optimizer's names",
-        "is of 4D Gaussian Splatting (fudan-zvg), whose splats have a time of their own, which is not read here", sure=BY_COMPANIONS,
-    ),
-    refused(
-        "training", "a training run", lambda files: files.words("param_groups"), "holds param_groups",
-        "is the state of a training run; give the point_cloud.ply or the model folder that was saved beside it", sure=0.3,
-    ),
-    refused(
-        "network", "a deformation network", lambda files: files.words("linear.0.weight", "nodes", "deformation_net"), "holds linear.0.weight",
-        "is a deformation network without its splats; give the model folder that holds both", sure=0.2,
-    ),
+    *REFUSED,
 )  # fmt: skip
 
 # All families by name; others are added by `register_model` and by the entry-point group.

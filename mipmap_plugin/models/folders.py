@@ -18,6 +18,9 @@ OF_POINTS = frozenset(
     ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha", "s", "t", "u", "v", "flags", "quality", "confidence", "intensity")
 )
 
+# So many of the files are named that lie in the place of a PLY.
+NAMED = 3
+
 # A folder that is given too high is searched so deep, as nerfstudio's outputs/EXPERIMENT/METHOD/TIME are, and in so many folders.
 DEPTH, MOST_LOOKED_AT = 3, 200
 
@@ -44,6 +47,23 @@ def _steps(folder: Path, family: Family, subfolder: str, pattern: str) -> dict[i
         return named
     # Files of other projects may have such names, too.
     return {step: file for step, file in named.items() if family.recognize(Files(file))}
+
+
+def splats_in(iteration: Path) -> Path:
+    """The PLY in a folder iteration_<N>, which may not exist. Raises CheckpointError for a folder with files of another kind in its place."""
+    ply = iteration / "point_cloud.ply"
+    if ply.exists():
+        return ply
+    if (scene := iteration / "scene_point_cloud.ply").exists():
+        raise CheckpointError(f"{iteration} is of SAGA; give the PLY of its scene itself: {scene}")
+    if parts := sorted(iteration.glob("point_cloud_rk0_ws*.ply")):  # of Grendel-GS, which names the number of files even if it is 1
+        return parts[0]
+    others = [entry.name for entry in sorted(iteration.iterdir()) if entry.is_file()] if iteration.is_dir() else []
+    if others:
+        named = f"{', '.join(others[:NAMED])}{', ...' * (len(others) > NAMED)}"
+        remedy = "make it with npz2ply.py, if c3dgs trained this" if f"{ply.stem}.npz" in others else "give a PLY of splats"
+        raise CheckpointError(f"{iteration} has {named}, but no point_cloud.ply, which is what is read here; {remedy}")
+    return ply
 
 
 def holds_points(file: Path) -> bool:

@@ -13,7 +13,7 @@ OTHERS = {
     ".ssproj": "a project of SuperSplat, which moves and tints its splats; open it there and export a PLY",
     ".psht": "a project of Postshot; open it there and export a PLY",
     ".rad": "RAD of Spark, which is not read here; give the file that it was made from",
-    ".npz": "a NumPy archive that no family knows; give a PLY file or a model folder, or register its family",
+    ".npz": "a NumPy archive that no family knows; give a PLY file, which npz2ply.py of c3dgs makes of its own, or register its family",
     ".hier": "a hierarchy of Hierarchical 3D Gaussians, whose splats follow the distance, which is not read here; "
     "give the PLY of one of its chunks (trained_chunks/<name>/point_cloud/iteration_<N>)",
 }

@@ -21,7 +21,7 @@ from mipmap_plugin.formats.splat_transform import MOST_BANDS, is_written, write_
 from mipmap_plugin.formats.tags import with_tags
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale, Traits
-from mipmap_plugin.models.columns import to_columns, to_parameters
+from mipmap_plugin.models.columns import in_short, to_columns, to_parameters
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
 from mipmap_plugin.models.health import LARGEST
 from mipmap_plugin.models.hosts import Capture, Host
@@ -170,7 +170,7 @@ class VanillaModel:
         leaves = {name: tensor if tensor.is_leaf else tensor.detach() for name, tensor in parameters.items()}
         self._parameters, self.shares = {name: leaf.requires_grad_() for name, leaf in leaves.items()}, False
         if self._origin.extras:
-            self.notes.append(f"the extra columns {', '.join(self._origin.extras)} are dropped, since splats were added or removed")
+            self.notes.append(f"the extra columns {in_short(self._origin.extras)} are dropped, since splats were added or removed")
             self._origin = replace(self._origin, extras={})
 
     def shared_parameters(self) -> dict[str, Tensor]:
