@@ -51,7 +51,7 @@ MERGING_COSTS = 9.0
 # level needs to be made of fewer, captures lost 2 to 2.5 dB at the first switch, which is seen, and for all zooms below; small scenes 6.
 MOST_LOST = 1.0
 
-# What levels are made for; "auto" is "distance" for a viewer of STREAMING and an unbounded scene, else "zoom".
+# What levels are made for; "auto" is "distance" for a viewer of STREAMING and an unbounded scene with cameras, else "zoom".
 WAYS = ("auto", "zoom", "distance")
 
 # Viewers that choose a level for each chunk by its distance.

@@ -174,6 +174,14 @@ def test_auto_is_by_distance_for_streaming_viewers_of_unbounded_scenes(viewer, b
     assert by_distance(wrapped(far=far) if far else wrap_model(tiny.model(), cameras=tiny.cameras(6)), LadderRequest(viewer, by=by)) is expected
 
 
+def test_auto_is_by_zoom_where_no_cameras_tell_distances():
+    """Captures of strangers are shown worse than their bases by the distances of a generated orbit."""
+    alone = wrap_model(wrapped().model)
+    alone.cameras = []
+    assert not by_distance(alone, LadderRequest("supersplat", by="auto"))
+    assert by_distance(alone, LadderRequest("supersplat", by="distance"))
+
+
 def test_auto_is_by_zoom_where_a_bound_asks_for_it():
     assert not by_distance(wrapped(), LadderRequest("supersplat", by="auto", least_db=30.0))
     assert by_distance(wrapped(), LadderRequest("supersplat", by="auto"))

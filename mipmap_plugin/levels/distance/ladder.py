@@ -75,10 +75,10 @@ def without_repeats(scene: DistanceScene, levels: list[Adapted]) -> tuple[Distan
 
 
 def by_distance(base: FrozenBase, request: LadderRequest) -> bool:
-    """Whether the levels of a request are made by distance."""
+    """Whether the levels of a request are made by distance. `auto`: not where no cameras tell any."""
     if request.by != "auto":
         return request.by == "distance"
-    if request.least_db is not None or request.until_splats is not None:
+    if not base.cameras or request.least_db is not None or request.until_splats is not None:
         return False
     effects, means = base.effects(), base.model.parameters()["means"].detach()
     mergeable = base.model.traits.same_for_all_views and not base.model.traits.filtered and effects.screen_filter not in INTEGRATED
