@@ -17,11 +17,11 @@ def warn(text: str) -> None:
     """`errors.warn`, unless this is inside `silent`; inside `held` it is kept."""
     if _silent.get():
         return
-    held = _held.get()
-    if held is None:
+    texts = _held.get()
+    if texts is None:
         errors.warn(text)
     else:
-        held.append(text)
+        texts.append(text)
 
 
 @contextmanager
