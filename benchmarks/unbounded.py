@@ -45,7 +45,8 @@ cameras (of yashica a fifth with pixels half as large). The protocol says by wha
 the same shrunk by Pillow's bicubic (a zoom-in is shrunk itself and compared with the base's image as it is); P3, photographs. What is the truth
 itself has no row. Of flowers at x2 the base's cameras are half as large, and Lanczos takes a network's place. One thread of a shared machine.
 
-Compare no SSIM of `instant` with that of other rows, but of yashica: these are of an earlier version, whose SSIM left a border of 5 px out.
+Compare no SSIM of `instant`, nor of `default` of bird_272, flowers_r8_every_2 and flowers_r8_every_8, with that of other rows, but of yashica: these
+are of an earlier version, whose SSIM left a border of 5 px out.
 """
 
 LANCZOS = dict(upsampler="lanczos as a network")
