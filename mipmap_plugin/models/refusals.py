@@ -68,6 +68,11 @@ def _is_of_ever(files: Files) -> bool:
         return False
 
 
+def _is_of_e_d3dgs(files: Files) -> bool:
+    """Other tools may call features so, but have no network beside them that moves splats."""
+    return files.holds_splats and "embedding_0" in files.columns and (files.path.parent / "deformation.pth").is_file()
+
+
 REFUSED = (
     family("part", "Grendel-GS", part_of_scene, before=OF_MORE_COLUMNS),
     refused(
@@ -104,7 +109,7 @@ REFUSED = (
         "is of EVER, whose ellipsoids are no Gaussians and are stored in another way, which is not read here", sure=BY_COMPANIONS,
     ),
     refused(
-        "e-d3dgs", "E-D3DGS", lambda files: files.holds_splats and "embedding_0" in files.columns, "column embedding_0",
+        "e-d3dgs", "E-D3DGS", _is_of_e_d3dgs, "column embedding_0 and a network beside it",
         "is of E-D3DGS, whose network moves splats by embeddings of their own, which is not read here", before=("4dgs", *OF_MORE_COLUMNS),
     ),
     refused(

@@ -16,8 +16,7 @@ ONE = COLUMNS["x"]
     [
         ("nothing", ["f_asg_0"], "Spec-Gaussian"), ("nothing", ["refl"], "3DGS-DR"), ("f_", ["f_intr_0"], "GS-W"),
         ("nothing", ["roughness", "specular0", "specular1", "specular2"], "GaussianShader"), ("nothing", ["binding_0"], "GaussianAvatars"),
-        ("nothing", ["degree", "negative"], "Student Splatting"), ("nothing", ["embedding_0", "embedding_1"], "E-D3DGS"),
-        ("f_", [], "without colors"),
+        ("nothing", ["degree", "negative"], "Student Splatting"), ("f_", [], "without colors"),
     ],
 )  # fmt: skip
 def test_columns_that_change_what_is_drawn_are_refused_by_name(tmp_path, without, added, said):
@@ -26,7 +25,7 @@ def test_columns_that_change_what_is_drawn_are_refused_by_name(tmp_path, without
         load_model(write(tmp_path / "a.ply", {**columns, **dict.fromkeys(added, ONE)}))
 
 
-@pytest.mark.parametrize("added", [["roughness", "base_color_0"], ["degree"], ["obj_dc_0"], ["semantic_0"]])
+@pytest.mark.parametrize("added", [["roughness", "base_color_0"], ["degree"], ["obj_dc_0"], ["semantic_0"], ["embedding_0", "embedding_1"]])
 def test_columns_beside_whole_colors_are_carried_along(tmp_path, added):
     """Relightable 3D Gaussian's harmonics are whole colors, whatever else it stores; so are those of projects that add features."""
     model = load_model(write(tmp_path / "a.ply", {**COLUMNS, **dict.fromkeys(added, ONE)}))
