@@ -51,7 +51,7 @@ def levels(
         ratio: Of neighboring scales; by default 1.74 for viewers that compensate or hardly dilate, else 1.41.
         least_db: Make a level again for a narrower band, down to a ratio of 1.19, if it falls below this PSNR at the ends of its band.
         until_splats: End with the first level that has at most this many splats, if that comes before the coarsest scale.
-        by: zoom, one scale for the whole scene; distance, one for each splat; auto: distance for viewers that stream and cameras that see far.
+        by: zoom, one scale for the whole scene; distance, one for each splat; auto: distance for viewers that stream, if cameras see far away.
         streamed_sog: Also write Streamed SOG for PlayCanvas, SuperSplat and Babylon.js, through splat-transform, with the distances to set there.
         tiles: Also write 3D Tiles for Cesium, through splat-transform.
         canvas: With --streamed-sog or --tiles: the shorter side in px of the canvas that distances are computed for; by default 1080.

@@ -27,6 +27,7 @@ from mipmap_plugin.levels.contents import Contents
 from mipmap_plugin.levels.yardstick import TRUTH
 from mipmap_plugin.models.places import MANIFEST as MANIFEST
 from mipmap_plugin.models.places import REPORT
+from mipmap_plugin.scenes.photographed import GOLDEN
 
 FORMAT = "mipmap_plugin levels 1"
 
@@ -35,9 +36,6 @@ CANVAS = 1080
 
 # Views that tell what they look at, by so many splats at most; and how many of these are told to what shows the ladder.
 LOOKED_AT, SAMPLE, TOLD = 64, 100_000, 256
-
-# The part of the way from one told splat to the next by which those of each further view lie later, modulo 1: the views tell different ones.
-GOLDEN = (math.sqrt(5) - 1) / 2
 
 # A module for pages of three.js, such as Spark's, that shows the level that fits.
 THREE_JS = "levels.js"
@@ -132,7 +130,8 @@ def looked_at(base: FrozenBase) -> list[list[float]]:
     for number, view in enumerate(views):
         points = view.to_camera(means)
         seen = view.in_picture(points, near).nonzero()[:, 0]
-        rows = seen[((torch.arange(each) + number * GOLDEN % 1) * len(seen) / each).long()] if len(seen) else seen
+        later = GOLDEN * number % 1  # of the way from one told splat to the next, so that the views tell different ones
+        rows = seen[((torch.arange(each) + later) * len(seen) / each).long()] if len(seen) else seen
         sizes = points[rows, 2:] / math.sqrt(view.fx * view.fy)
         told += torch.cat([means[rows], sizes.to(means)], dim=1).tolist()
     return [[float(f"{value:.6g}") for value in row] for row in told]
