@@ -28,6 +28,7 @@ from mipmap_plugin.splatting.packing import packed
 NO_NUMBA = f"it needs numba, which some Pythons and processors have no wheels of; where there are, {install('cpu')}"
 NO_FOLDER = "numba has no writable folder for compiled code; set the environment variable NUMBA_CACHE_DIR to one"
 DISABLED = "the variable NUMBA_DISABLE_JIT keeps numba from compiling; unset it"
+NO_THREADS = "the variable NUMBA_NUM_THREADS gives numba no threads; set it to 1 or more, or unset it"
 REINSTALL = "install it anew, where there are wheels by pip install --force-reinstall numba, which brings all that it needs"
 
 # Settings that kernels of screen filters that integrate do not read.
@@ -161,7 +162,8 @@ def missing() -> list[str]:
         importlib.import_module("mipmap_plugin.backends.cpu_kernels.drawing")
     except Exception as error:  # numba built for another numpy, or without its compiler, may fail in any way
         failed = f"numba does not load: {type(error).__name__}: {brief(error).rstrip('.')}; {REINSTALL}"
-        return [NO_FOLDER if "cannot cache" in str(error) else failed]
+        known = {"cannot cache": NO_FOLDER, "Number of threads": NO_THREADS}  # by what numba says
+        return [next((remedy for words, remedy in known.items() if words in str(error)), failed)]
     return []
 
 

@@ -32,6 +32,15 @@ print(json.dumps(told))
 """
 
 
+def by_backends(folder, variables):
+    """What a process with these environment variables tells by `BY_BACKENDS`."""
+    words = ["adapt", str(tiny.folder(folder / "base")), "--scale", "1/2", "--steps", "1", "--views", "given", "--overwrite"]
+    command = [sys.executable, "-c", BY_BACKENDS, *words]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **variables})
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
 @pytest.fixture(scope="module")
 def told(tmp_path_factory):
     """What a process whose numba does not load tells by `BY_BACKENDS`."""
@@ -39,11 +48,7 @@ def told(tmp_path_factory):
     package = folder / "broken" / "numba"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text("raise ImportError('Numba needs NumPy 2.2 or less.')")
-    environment = {**os.environ, "PYTHONPATH": f"{package.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
-    words = ["adapt", str(tiny.folder(folder / "base")), "--scale", "1/2", "--steps", "1", "--views", "given", "--overwrite"]
-    done = subprocess.run([sys.executable, "-c", BY_BACKENDS, *words], capture_output=True, text=True, env=environment)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
+    return by_backends(folder, {"PYTHONPATH": f"{package.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"})
 
 
 def test_torch_takes_its_place(told):
@@ -53,6 +58,12 @@ def test_torch_takes_its_place(told):
 
 def test_the_backend_that_needs_it_ends_in_a_sentence(told):
     assert told["cpu"] == [2, [f"mipmap-plugin: backend 'cpu' cannot do this, but reference can: {REMEDY}"]]
+
+
+def test_a_numba_without_threads_is_told_of(tmp_path):
+    pytest.importorskip("numba")
+    [said] = by_backends(tmp_path, {"NUMBA_NUM_THREADS": "0"})["auto"][1]
+    assert said == f"mipmap-plugin: backend cpu cannot do this: {cpu.NO_THREADS}; the backend reference takes its place, many times slower"
 
 
 def test_without_numba_the_error_says_what_to_install(monkeypatch):
