@@ -52,6 +52,7 @@ class Task:
     follow: Following = field(default_factory=Following)  # called before each step
     color_limits: tuple[float, float] | None = None  # of the coefficients of SH degree 0, which a step leaves within them
     part: str = ""  # of a scene, such as a tile or a level by distance, whose views are of another scale
+    pixel: float | None = None  # world units: the means move by such; None: by the pixel of the new scale at the median splat
 
     @cached_property
     def cameras(self) -> Mapping[Camera, Camera]:
@@ -113,7 +114,8 @@ class Run:
     def start(cls, student: SplatModel, task: Task, config: AdaptConfig, spent: float = 0.0) -> Run:
         """A run before its first step; `spent`: the seconds used so far."""
         means = student.parameters()["means"]
-        optimizer, watch = make_optimizer(student, config, target_pixel(student, task.views, task.scale)), Stopwatch(seconds=spent)
+        pixel = target_pixel(student, task.views, task.scale) if task.pixel is None else task.pixel
+        optimizer, watch = make_optimizer(student, config, pixel), Stopwatch(seconds=spent)
         with watch:
             trial = Trial(task.agreement(student, config)) if config.densify_on_trial and config.densify_gradient is not None else None
             costs = Costs(motion=lambda: task.follow.seconds, device=means.device)

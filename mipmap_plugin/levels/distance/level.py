@@ -52,16 +52,6 @@ AS_FINER = "the finer level as it is"
 USES = 6
 
 
-@dataclass(frozen=True)
-class WalkTask(Task):
-    """A task whose rates are in pixels of the level, and not in those at the median splat, which may be far away and not move."""
-
-    size: float = 1.0  # world units
-
-    def pixel(self, model: SplatModel) -> float:
-        return self.size
-
-
 @dataclass(eq=False)
 class LevelRun:
     """The making of one level below the first."""
@@ -125,7 +115,8 @@ class LevelRun:
         states = {f"the start, {name}": initial}
         self.seconds["start"] = self.seconds["total"] = now(self.finest.means.device) - began
         if self.config.steps:
-            task = WalkTask(self.views, 1.0, self.truth, [self._render], False, self.validation, part=f"level {self.number}", size=self.size)
+            # The median splat may be far away, where this level is not shown.
+            task = Task(self.views, 1.0, self.truth, [self._render], False, self.validation, part=f"level {self.number}", pixel=self.size)
             keeper = StateKeeper(resume, self._fingerprint())
             run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
             ended_by = adapt(run, task, self.config, keeper.save_and_stop, keeper.save_if_due).told(self.config, run.step)
