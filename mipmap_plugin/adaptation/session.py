@@ -30,7 +30,7 @@ from mipmap_plugin.adaptation.shown import refuse_blind, remarks, showing, too_u
 from mipmap_plugin.adaptation.start.bands import used_degree, with_more_bands
 from mipmap_plugin.adaptation.start.candidates import best_start
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
-from mipmap_plugin.adaptation.start.matcher import UNMATCHED
+from mipmap_plugin.adaptation.start.matching import UNMATCHED
 from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.adaptation.start.splitting import in_parts
 from mipmap_plugin.adaptation.target.detail import DetailLoss, unused_upsampler

@@ -13,10 +13,10 @@ from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.pixel_size import pixel_size
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.base_weights import note_on_hidden, weighed_in_parts
-from mipmap_plugin.adaptation.start.blend_weights import may_show, wanted_of, whole_weights
+from mipmap_plugin.adaptation.start.blend_weights import Wanted, may_show, wanted_of, whole_weights
 from mipmap_plugin.adaptation.start.candidates import start_name
 from mipmap_plugin.adaptation.start.closed_form import LEAST_AXIS, FormSettings, closed_form, draws_alike, filter_suffices
-from mipmap_plugin.adaptation.start.matching import Wanted, matched_opacities, sweeps_over
+from mipmap_plugin.adaptation.start.matching import matched_opacities, sweeps_over
 from mipmap_plugin.adaptation.start.merging import merge_down, merge_seen
 from mipmap_plugin.adaptation.start.strength import Bounds, Candidate, Merger, MergingCosts
 from mipmap_plugin.camera import Camera

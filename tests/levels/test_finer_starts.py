@@ -60,7 +60,7 @@ def test_what_is_merged_too_coarsely_leaves_the_choice_to_plain_merging(monkeypa
     def quality(model):
         return Quality(*[{"finer": 38.0, "base": base_db, "formed": 34.0}.get(model[0], coarse_db if model[-1] else 33.0)] * 2)
 
-    def candidate(_, weights, fraction, coarsely=False):
+    def candidate(_, fraction=1.0, coarsely=False):
         return Base(("formed",) if fraction == 1 else ("merged", fraction, coarsely))
 
     class Base(tuple):

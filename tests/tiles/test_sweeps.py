@@ -11,7 +11,7 @@ from cut_scenes import config, cut_in_three
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, TIE_DB, Quality
 from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS
 from mipmap_plugin.adaptation.schedule import ViewSchedule
-from mipmap_plugin.adaptation.start.matching import PARTS
+from mipmap_plugin.adaptation.start.blend_weights import PARTS
 from mipmap_plugin.adaptation.start.strength import Merger
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.models.base import TrainedScale

@@ -14,10 +14,10 @@ from mipmap_plugin.adaptation.optimization.amount import takes_steps
 from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.pixel_size import mean_pixel_size
 from mipmap_plugin.adaptation.start.base_weights import BaseWeights
+from mipmap_plugin.adaptation.start.blend_weights import Wanted
 from mipmap_plugin.adaptation.start.clock import Clock, start_clock
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, LEAST_AXIS, FormSettings, closed_form, draws_alike
-from mipmap_plugin.adaptation.start.matcher import Matcher
-from mipmap_plugin.adaptation.start.matching import Wanted
+from mipmap_plugin.adaptation.start.matching import Matcher
 from mipmap_plugin.adaptation.start.merging import MergingRounds, merge_down, merge_seen
 from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.adaptation.start.strength import POWERS, Bounds, Candidate, Merger, MergingCosts
@@ -86,6 +86,7 @@ class StartSearch:
         self._least, self._crispness = 0.0, problem.config.crispness  # the fraction of the rows that stay, of a zoom-in how crisp it is
         self._power = AREA_POWER  # of the areas, where opacities are not matched
         self._seen = BaseWeights(problem, clock)
+        self._weights: Tensor | None = None  # [N, P]: the blend weights of the base's splats, once they are measured
         self._matcher = Matcher(problem, clock, self._seen)
         self.notes = self._seen.notes
         self._alike = draws_alike(problem.base_effects, problem.target)
@@ -101,62 +102,62 @@ class StartSearch:
             return base, problem.name
         with problem.phase("blend weights"):
             merges = config.merge_to < 1 and not base.traits.thins
-            weights = self._seen.measured(base) if self._matcher.is_of_use or merges or too_many else None
+            self._weights = self._seen.measured(base) if self._matcher.is_of_use or merges or too_many else None
         if too_many:
-            return self._with_most(weights), start_name(self._forms, merged=True)
-        if (merged := self._merged_at_once(weights)) is not None:
+            return self._with_most(), start_name(self._forms, merged=True)
+        if (merged := self._merged_at_once()) is not None:
             return merged, start_name(self._forms, merged=True)
         with self._clock.timing("candidate"):
-            formed = self._candidate(weights, 1.0)
+            formed = self._candidate()
         if config.merge_to == 1 and config.returns == "last":
             return formed, start_name(self._forms)
-        before, (formed, after) = problem.quality(base), self._as_crisp_as_shown(formed, weights)
-        formed, after = self._matched_as_shown(formed, after, weights)
+        before, (formed, after) = problem.quality(base), self._as_crisp_as_shown(formed)
+        formed, after = self._matched_as_shown(formed, after)
         if self._alike and after.visible < before.visible:  # the filter itself is the better answer, for merged splats too
             self._forms, after = False, before
         bounds = Bounds(self._least_psnr(after), before.visible - problem.may_lose, after.psnr)
         self._least = least_fraction(base, problem.views, problem.scale) if base.traits.thins else 0.0
         fewer = config.merge_to < 1 and self._least < 1
-        if fewer and (strongest := self._merger(weights).strongest(bounds, self._coarse_bounds(bounds, before))):
+        if fewer and (strongest := self._merger().strongest(bounds, self._coarse_bounds(bounds, before))):
             return strongest.made, start_name(self._forms, merged=True, thinned=base.traits.thins)
         return (formed, start_name(True)) if self._forms and after.visible >= before.visible else (base, problem.name)
 
-    def _as_crisp_as_shown(self, formed: SplatModel, weights: Tensor | None) -> tuple[SplatModel, Quality]:
+    def _as_crisp_as_shown(self, formed: SplatModel) -> tuple[SplatModel, Quality]:
         """The closed form, or a crisper one where a small zoom-in takes no steps and looks better by that; and its quality."""
         problem, quality = self._problem, self._problem.quality(formed)
         still = self._forms and not self._learns and 1 < problem.scale < CRISPER_BELOW
         for crispness in CRISPER if still else ():
             if crispness > (before := self._crispness) and self._clock.allows("candidate"):
                 self._crispness = crispness
-                crisper = self._candidate(weights, 1.0)
+                crisper = self._candidate()
                 if (better := problem.quality(crisper)).visible <= quality.visible:
                     self._crispness = before
                     break
                 formed, quality = crisper, better
         return formed, quality
 
-    def _matched_as_shown(self, formed: SplatModel, quality: Quality, weights: Tensor | None) -> tuple[SplatModel, Quality]:
+    def _matched_as_shown(self, formed: SplatModel, quality: Quality) -> tuple[SplatModel, Quality]:
         """The closed form, or with opacities matched in fewer or more sweeps if no step follows and it looks better by that; and its quality."""
-        if self._learns or not self._forms or not self._matcher.is_of_use or weights is None:
+        if self._learns or not self._forms or not self._matcher.is_of_use or self._weights is None:
             return formed, quality
-        less, better = self._matched_less(formed, quality, weights)
+        less, better = self._matched_less(formed, quality)
         further, best = self._matched_further(formed, quality, self._seen.of_base, self._problem.base)
         if less is not formed and better.visible > best.visible:
             return less, better
-        self._matcher.wanted = None if further is formed else (*self._matcher.sweeps.usual, *self._matcher.sweeps.further)  # of merged splats too
+        self._matcher.sweeps = None if further is formed else (*self._matcher.possible.usual, *self._matcher.possible.further)  # of merged splats too
         return further, best
 
-    def _matched_less(self, formed: SplatModel, quality: Quality, weights: Tensor) -> tuple[SplatModel, Quality]:
+    def _matched_less(self, formed: SplatModel, quality: Quality) -> tuple[SplatModel, Quality]:
         """The closed form, or with opacities matched in fewer sweeps where many become too faint to be drawn, if it looks better; and its quality."""
         drawn, still_drawn = (self._drawn(model) for model in (self._problem.base(), formed))
         fewer = FEWER[:-1] if self._alike else FEWER  # the last is no closed form of a filter that draws alike
         for sweeps, power in fewer if (drawn & ~still_drawn).float().mean() > FAINT else ():
             if self._clock.allows("candidate"):
-                self._matcher.wanted, self._power = sweeps, power
-                less = self._candidate(weights, 1.0)
+                self._matcher.sweeps, self._power = sweeps, power
+                less = self._candidate()
                 if (better := self._problem.quality(less)).visible > quality.visible:
                     formed, quality = less, better
-        self._matcher.wanted, self._power = None, AREA_POWER
+        self._matcher.sweeps, self._power = None, AREA_POWER
         return formed, quality
 
     def _drawn(self, model: SplatModel) -> Tensor:
@@ -170,7 +171,7 @@ class StartSearch:
 
         `copied`: makes a model of the same splats, whose scales and opacities may be others.
         """
-        problem, sweeps = self._problem, self._matcher.sweeps.further
+        problem, sweeps = self._problem, self._matcher.possible.further
         if not self._matcher.allows(wanted.weights, sweeps):
             return formed, quality
         further, splats = copied(), formed.gaussians(problem.views[0]).detach()
@@ -179,25 +180,25 @@ class StartSearch:
         better = problem.quality(further)
         return (further, better) if better.visible > quality.visible - EVEN else (formed, quality)
 
-    def _with_most(self, weights: Tensor | None) -> SplatModel:
+    def _with_most(self) -> SplatModel:
         """The closed form of `most_splats` merged splats."""
-        student, weights = self._reduced(weights, 0.0)
+        student, weights = self._reduced(0.0)
         merged = student.gaussians(self._problem.views[0]).detach()
         self._form(student, weights)
         if self._learns or not self._forms or not self._matcher.is_of_use or weights is None:
             return student
         return self._matched_further(student, self._problem.quality(student), self._seen.wanted(merged, weights), student.copy)[0]
 
-    def _merged_at_once(self, weights: Tensor | None) -> SplatModel | None:
+    def _merged_at_once(self) -> SplatModel | None:
         """The strongest merging, where a time budget is too short for a search and this is no worse than the base; else None."""
         problem, student, fraction = self._problem, self._problem.base(), self._fraction(1)
-        if not self._clock.limited or weights is None or student.traits.thins or problem.coarse_base is not None:
+        if not self._clock.limited or self._weights is None or student.traits.thins or problem.coarse_base is not None:
             return None
         if fraction > FAR_FEWER or not problem.config.steps:
             return None
         with problem.phase("merging"):
-            new_weights = self._merge(student, weights, fraction, coarsely=False)
-        left = len(new_weights) / len(weights)
+            new_weights = self._merge(student, self._weights, fraction, coarsely=False)
+        left = len(new_weights) / len(self._weights)
         if left > REACHED * fraction:
             return None
         least = problem.quality(problem.base()).visible - problem.may_lose
@@ -214,7 +215,7 @@ class StartSearch:
             return least
         return max(least, (formed.psnr + problem.quality(problem.coarse_base()).psnr) / 2)
 
-    def _merger(self, weights: Tensor | None) -> Merger[SplatModel]:
+    def _merger(self) -> Merger[SplatModel]:
         problem, count = self._problem, len(self._problem.base().parameters()["means"])
 
         def merge(power: float, coarsely: bool) -> Candidate[SplatModel] | None:
@@ -222,7 +223,7 @@ class StartSearch:
             if not self._clock.allows("candidate", fraction):
                 return None
             with self._clock.timing("candidate", fraction):
-                candidate = self._candidate(weights, fraction, coarsely)
+                candidate = self._candidate(fraction, coarsely)
                 return Candidate(candidate, problem.quality(candidate), len(candidate.parameters()["means"]))
 
         costs = MergingCosts.of(problem.config, problem.base_effects, problem.target)
@@ -239,15 +240,15 @@ class StartSearch:
         base = self._problem.quality(coarse_base())
         return bounds._replace(psnr=max(bounds.psnr, LEAST_DB, finer.psnr - self._problem.may_lose, base.psnr - COARSE_COSTS))
 
-    def _candidate(self, weights: Tensor | None, fraction: float, coarsely: bool = False) -> SplatModel:
+    def _candidate(self, fraction: float = 1.0, coarsely: bool = False) -> SplatModel:
         """The base in closed form, after merging its splats (`_reduced`)."""
-        student, weights = self._reduced(weights, fraction, coarsely)
+        student, weights = self._reduced(fraction, coarsely)
         self._form(student, weights)
         return student
 
-    def _reduced(self, weights: Tensor | None, fraction: float, coarsely: bool = False) -> tuple[SplatModel, Tensor | None]:
+    def _reduced(self, fraction: float, coarsely: bool = False) -> tuple[SplatModel, Tensor | None]:
         """The base after merging its splats down to a fraction of them, or to the settings' `most_splats`; and the blend weights of these."""
-        problem, student = self._problem, self._problem.base()
+        problem, student, weights = self._problem, self._problem.base(), self._weights
         if fraction < 1 and weights is not None:
             with problem.phase("merging"):
                 weights = self._merge(student, weights, fraction, coarsely)

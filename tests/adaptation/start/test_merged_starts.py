@@ -29,7 +29,7 @@ def worth(monkeypatch):
             return Quality(*[float(psnr(len(tried) - 1, len(model)))] * 2)
 
         monkeypatch.setattr(Validation, "quality", quality)
-        monkeypatch.setattr(candidates.StartSearch, "_matched_as_shown", lambda self, formed, quality, weights: (formed, quality))
+        monkeypatch.setattr(candidates.StartSearch, "_matched_as_shown", lambda self, formed, quality: (formed, quality))
         return tried
 
     return give
