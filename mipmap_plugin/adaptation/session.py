@@ -28,10 +28,10 @@ from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, change
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer, ends_run
 from mipmap_plugin.adaptation.shown import refuse_blind, remarks, showing, too_unlike, worse_views
 from mipmap_plugin.adaptation.start.bands import used_degree, with_more_bands
-from mipmap_plugin.adaptation.start.candidates import best_start
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
 from mipmap_plugin.adaptation.start.matching import UNMATCHED
 from mipmap_plugin.adaptation.start.problem import StartProblem
+from mipmap_plugin.adaptation.start.search import best_start
 from mipmap_plugin.adaptation.start.splitting import in_parts
 from mipmap_plugin.adaptation.target.detail import DetailLoss, unused_upsampler
 from mipmap_plugin.adaptation.target.photographs import Photographs

@@ -11,7 +11,7 @@ import torch
 
 from mipmap_plugin.adaptation.start import matching
 from mipmap_plugin.adaptation.start.blend_weights import Wanted, blend_weights
-from mipmap_plugin.adaptation.start.candidates import StartSearch
+from mipmap_plugin.adaptation.start.candidates import Candidates
 from mipmap_plugin.adaptation.start.clock import Clock
 from mipmap_plugin.adaptation.start.matching import MAX_FACTOR, PART_PIXELS, SWEEPS, UNMATCHED, WIDE, Matcher, matched_opacities, sweeps_over
 from mipmap_plugin.backends.reference import ReferenceBackend
@@ -186,8 +186,8 @@ def test_without_steps_opacities_that_come_out_too_faint_are_matched_in_fewer_sw
 
 @pytest.mark.parametrize(("screen_filter", "count"), [("classic", 4), ("antialiased", 3)])
 def test_a_filter_that_draws_alike_has_no_closed_form_without_matching(monkeypatch, screen_filter, count):
-    tried, candidate = [], StartSearch._candidate
-    monkeypatch.setattr(StartSearch, "_candidate", lambda *given: tried.append(1) or candidate(*given))
+    tried, candidate = [], Candidates.make
+    monkeypatch.setattr(Candidates, "make", lambda *given: tried.append(1) or candidate(*given))
     monkeypatch.setattr(matching, "matched_opacities", lambda opacities, *_: opacities * 1e-4)
     wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference", screen_filter=screen_filter).adapt(1 / 4, recipe="instant", merge_to=1.0)
     assert len(tried) == count

@@ -16,8 +16,8 @@ from mipmap_plugin.adaptation.optimization.steering import Steering
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB
 from mipmap_plugin.adaptation.renderers import Renderer
 from mipmap_plugin.adaptation.start import matching
-from mipmap_plugin.adaptation.start.candidates import StartSearch
 from mipmap_plugin.adaptation.start.matching import Sweeps
+from mipmap_plugin.adaptation.start.search import StartSearch
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.formats.ply import read_ply
