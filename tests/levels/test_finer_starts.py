@@ -99,7 +99,8 @@ def test_at_most_so_many_splats_are_left_whatever_it_costs(most):
     assert "the base as it is" in adapted.report.validation and not adapted.report.returned.startswith("the base as it is")
 
 
-def test_a_count_above_the_bases_changes_nothing():
-    options = dict(viewer="antialiased", steps=0, validation_views=2, merge_to=1.0)
-    one, other = (wrapped().adapt(1 / 2, **options, **more).model.parameters() for more in ({}, {"most_splats": 12}))
-    assert all(torch.equal(one[name], other[name]) for name in one)
+def test_a_count_above_the_bases_merges_nothing_and_says_so():
+    options = dict(viewer="antialiased", steps=0, validation_views=2)
+    one, other = (wrapped().adapt(1 / 2, **options, **more) for more in ({"merge_to": 1.0}, {"merge_to": 0.5, "most_splats": 12}))
+    assert one.report.validation == other.report.validation and "merging" not in other.report.seconds
+    assert all(torch.equal(tensor, other.model.parameters()[name]) for name, tensor in one.model.parameters().items())

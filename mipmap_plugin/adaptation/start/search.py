@@ -78,6 +78,7 @@ class StartSearch:
     def __init__(self, problem: StartProblem, clock: Clock) -> None:
         self._problem, self._clock = problem, clock
         self._candidates = Candidates(problem, clock)
+        self._merge_to = problem.config.merge_to if problem.config.most_splats is None else 1.0  # a number of splats takes its place
         self._least = 0.0  # the fraction of the rows that stay
         self._alike = draws_alike(problem.base_effects, problem.target)
 
@@ -91,10 +92,10 @@ class StartSearch:
         """Return the model to begin with, which may share tensors with the base, and its name."""
         problem, config, base, candidates = self._problem, self._problem.config, self._problem.base(), self._candidates
         too_many = config.most_splats is not None and len(base.parameters()["means"]) > config.most_splats
-        if not (config.closed_form or config.merge_to < 1 or too_many):
+        if not (config.closed_form or self._merge_to < 1 or too_many):
             return base, problem.name
         with problem.phase("blend weights"):
-            merges = config.merge_to < 1 and not base.traits.thins
+            merges = self._merge_to < 1 and not base.traits.thins
             candidates.weights = candidates.seen.measured(base) if candidates.matcher.is_of_use or merges or too_many else None
         if too_many:
             return self._with_most(), start_name(candidates.forms, MERGED_SPLATS)
@@ -102,7 +103,7 @@ class StartSearch:
             return merged, start_name(candidates.forms, MERGED_SPLATS)
         with self._clock.timing("candidate"):
             formed = candidates.make()
-        if config.merge_to == 1 and config.returns == "last":
+        if self._merge_to == 1 and config.returns == "last":
             return formed, start_name(candidates.forms)
         before, (formed, after) = problem.quality(base), self._as_crisp_as_shown(formed)
         formed, after = self._matched_as_shown(formed, after)
@@ -110,7 +111,7 @@ class StartSearch:
             candidates.forms, after = False, before
         bounds = Bounds(self._least_psnr(after), before.visible - problem.may_lose, after.psnr)
         self._least = least_fraction(base, problem.views, problem.scale) if base.traits.thins else 0.0
-        fewer = config.merge_to < 1 and self._least < 1
+        fewer = self._merge_to < 1 and self._least < 1
         if fewer and (strongest := self._merger().strongest(bounds, self._coarse_bounds(bounds, before))):
             return strongest.made, start_name(candidates.forms, PART_OF_BASE if base.traits.thins else MERGED_SPLATS)
         return (formed, start_name(True)) if candidates.forms and after.visible >= before.visible else (base, problem.name)
@@ -223,7 +224,7 @@ class StartSearch:
 
     def _fraction(self, power: float) -> float:
         """The fraction of the splats that a power of `merge_to` leaves."""
-        return max(self._least, math.pow(self._problem.config.merge_to, power))
+        return max(self._least, math.pow(self._merge_to, power))
 
     def _coarse_bounds(self, bounds: Bounds, finer: Quality) -> Bounds | None:
         """The bounds of a coarsely merged candidate; None where there are none of these. `finer`: the quality of the finer level."""
