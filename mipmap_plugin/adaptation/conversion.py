@@ -80,8 +80,7 @@ class Stages:
 
     def _in_two(self, scale: float, config: AdaptConfig, first: AdaptConfig, cameras: list[Camera]) -> Adapted:
         """Convert the base with the settings `first`, and adapt what that returns to `scale`."""
-        session = Session(self.request, 1.0, first, cameras, None)
-        session.wanted = scale
+        session = Session(replace(self.request, zoom_in=scale), 1.0, first, cameras, None)
         converted = replace(session.run(self.resume and conversion_state(self.resume), self.observe), judge=None)  # which nobody saves
         stopped = session.ended is End.OBSERVER
         del session  # with the truths of its views

@@ -38,9 +38,10 @@ class Drawn:
         """What draws as each of the extremes does."""
         return [Renderer(backend, target) for target in self.extremes.values()]
 
-    def renders_to_step(self, backend: Backend) -> list[Renderer]:
-        """What steps draw with: the same, `unrounded`."""
-        return [Renderer(backend, unrounded(target)) for target in self.extremes.values()]
+    @property
+    def to_step(self) -> list[Effects]:
+        """How steps draw: as the extremes, `unrounded`."""
+        return [*map(unrounded, self.extremes.values())]
 
     def copied(self, model: SplatModel, *, shared: bool = False) -> SplatModel:
         """A copy of a model that is rendered with the target's screen filter; `shared`: with the model's tensors, if it can have these."""

@@ -42,6 +42,7 @@ class AdaptationRequest:
     finer: FinerLevel | None = None  # what the run starts from instead of the base
     inputs: Mapping[str, str] = field(default_factory=dict)  # `Report.inputs`
     budget_share: float = 1.0  # of the time budget that was asked for, which the settings have
+    zoom_in: float | None = None  # of a conversion: the scale of the zoom-in that starts from what it returns, so that its state is kept
 
     def fingerprint(self, scale: float, config: AdaptConfig, views: Sequence[Camera]) -> str:
         """A hash of everything that a run to `scale` depends on, so that a state is never resumed as another run."""

@@ -43,7 +43,6 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     step and after each step; its time is not counted, and the run ends if it returns True.
     """
     order = ViewSchedule(task.views, config)
-    run.costs.motion = lambda: task.follow.seconds
     bar = StepsBar.of(run, task, config, order)
     with bar, ticking(bar), interruptible() as interrupted:
         reason = End.OBSERVER if observe(run) else run.reason_to_stop(config)
