@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+from mipmap_plugin.adaptation.portable import extreme_targets
 from mipmap_plugin.adaptation.renderers import Renderer, unrounded
-from mipmap_plugin.adaptation.target.portable import extreme_targets
 from mipmap_plugin.backends.base import Backend, Needs
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.models.base import SplatModel

@@ -23,6 +23,7 @@ from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import COMPARED_WITH_BASE, HARM_DB, WINDOW, Quality, Validation, split_validation
+from mipmap_plugin.adaptation.portable import median_target
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, color_limits, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, option_note, simulated, versions
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer, ends_run
@@ -35,7 +36,6 @@ from mipmap_plugin.adaptation.start.search import best_start
 from mipmap_plugin.adaptation.start.splitting import in_parts
 from mipmap_plugin.adaptation.target.detail import DetailLoss, unused_upsampler
 from mipmap_plugin.adaptation.target.photographs import Photographs
-from mipmap_plugin.adaptation.target.portable import median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.views import choose_views, over_band
