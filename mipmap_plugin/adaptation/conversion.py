@@ -16,13 +16,13 @@ from pathlib import Path
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
-from mipmap_plugin.adaptation.optimization.validation import count_of_views
 from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer
 from mipmap_plugin.adaptation.session import Session
-from mipmap_plugin.adaptation.shown import orbited, seeing
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.photographs import Photographs
+from mipmap_plugin.adaptation.views.for_validation import count_of_views
+from mipmap_plugin.adaptation.views.shown import orbited, seeing
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import ONE_PIXEL, Camera
 from mipmap_plugin.config import AdaptConfig

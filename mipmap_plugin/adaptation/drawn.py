@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from mipmap_plugin.adaptation.portable import extreme_targets
+from mipmap_plugin.adaptation.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.renderers import Renderer, unrounded
 from mipmap_plugin.backends.base import Backend, Needs
 from mipmap_plugin.effects import Effects
@@ -33,6 +33,11 @@ class Drawn:
     def extremes(self) -> dict[str, Effects]:
         """The targets that steps draw."""
         return extreme_targets(self.targets)
+
+    @property
+    def median(self) -> Effects:
+        """The target that a start is made for."""
+        return median_target(self.targets)
 
     def renders(self, backend: Backend) -> list[Renderer]:
         """What draws as each of the extremes does."""

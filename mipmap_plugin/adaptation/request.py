@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import BaseImages
-from mipmap_plugin.adaptation.viewpoints import Viewpoints
+from mipmap_plugin.adaptation.views.viewpoints import Viewpoints
 from mipmap_plugin.camera import Camera, digest_of
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects

@@ -11,23 +11,20 @@ from pathlib import Path
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch
 from mipmap_plugin.adaptation.drawn import Drawn
-from mipmap_plugin.adaptation.following import Following, release
 from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_trained, psnr_per_viewer, too_far_out, worse_viewers
-from mipmap_plugin.adaptation.moments import at_their_moments, evaluate_moments
 from mipmap_plugin.adaptation.optimization.amount import affordable_for_model, affordable_moments, fewer_note, looks_in_budget, takes_steps
 from mipmap_plugin.adaptation.optimization.budget import for_upsampling, no_steps_notes, plan_note, within_budget
 from mipmap_plugin.adaptation.optimization.ending import End
+from mipmap_plugin.adaptation.optimization.following import Following, release
 from mipmap_plugin.adaptation.optimization.growing import growth_note
 from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
-from mipmap_plugin.adaptation.optimization.validation import COMPARED_WITH_BASE, HARM_DB, WINDOW, Quality, Validation, split_validation
-from mipmap_plugin.adaptation.portable import median_target
+from mipmap_plugin.adaptation.optimization.validation import COMPARED_WITH_BASE, HARM_DB, Quality, Validation
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, color_limits, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, option_note, simulated, versions
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer, ends_run
-from mipmap_plugin.adaptation.shown import refuse_blind, remarks, showing, too_unlike, worse_views
 from mipmap_plugin.adaptation.start.bands import used_degree, with_more_bands
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
 from mipmap_plugin.adaptation.start.matching import UNMATCHED
@@ -38,7 +35,10 @@ from mipmap_plugin.adaptation.target.detail import DetailLoss, unused_upsampler
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views import choose_views, over_band
+from mipmap_plugin.adaptation.views.for_validation import WINDOW, split_validation
+from mipmap_plugin.adaptation.views.moments import at_their_moments, evaluate_moments
+from mipmap_plugin.adaptation.views.policy import choose_views, over_band
+from mipmap_plugin.adaptation.views.shown import refuse_blind, remarks, showing, too_unlike, worse_views
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Calls
 from mipmap_plugin.camera import ONE_PIXEL, Camera, evenly
@@ -140,7 +140,7 @@ class Session:
     def _start_problems(self) -> list[StartProblem]:
         from_base = StartProblem(
             lambda: self.drawn.copied(self.base, shared=True), self.base_views, self._closest_of, self.scale, self.drawn.base,
-            median_target(self.drawn.targets), self.config, self.backend, self._has_blend_weights, self.quality, self.phase,
+            self.drawn.median, self.config, self.backend, self._has_blend_weights, self.quality, self.phase,
             may_lose=self.config.merging_costs if len(self.drawn.targets) > 1 and self.config.steps else 0.0,
         )  # fmt: skip
         if (finer := self.finer) is None:

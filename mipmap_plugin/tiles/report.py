@@ -13,8 +13,8 @@ from mipmap_plugin.adaptation.optimization.amount import fewer_note
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.validation import Quality, last_of_best
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report, filters, simulated, versions
-from mipmap_plugin.adaptation.shown import worse_views
 from mipmap_plugin.adaptation.target.upsamplers import network_input
+from mipmap_plugin.adaptation.views.shown import worse_views
 from mipmap_plugin.errors import plural, warn
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.torch_file import load_torch

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.validation import Quality
-from mipmap_plugin.adaptation.pixel_size import pixel_size
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.base_weights import note_on_hidden, weighed_in_parts
 from mipmap_plugin.adaptation.start.blend_weights import Wanted, may_show, wanted_of, whole_weights
@@ -19,6 +18,7 @@ from mipmap_plugin.adaptation.start.matching import matched_opacities, sweeps_ov
 from mipmap_plugin.adaptation.start.merging import merge_down, merge_seen
 from mipmap_plugin.adaptation.start.search import MERGED_SPLATS, start_name
 from mipmap_plugin.adaptation.start.strength import Bounds, Candidate, Merger, MergingCosts
+from mipmap_plugin.adaptation.views.pixel_size import pixel_size
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.formats.torch_file import save_torch

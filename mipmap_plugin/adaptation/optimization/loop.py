@@ -23,7 +23,7 @@ from mipmap_plugin.adaptation.optimization.losses import compare
 from mipmap_plugin.adaptation.optimization.optimizer import set_rates
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.parallel import large_for_torch, max_threads, together, views_at_once
-from mipmap_plugin.adaptation.schedule import ViewSchedule
+from mipmap_plugin.adaptation.views.schedule import ViewSchedule
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.process.threads import side_by_side

@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS, pixel_size, views_for
 from mipmap_plugin.adaptation.start.blend_weights import PARTS, Wanted, may_show, wanted_of, weighed
 from mipmap_plugin.adaptation.start.clock import Clock
 from mipmap_plugin.adaptation.start.problem import StartProblem
+from mipmap_plugin.adaptation.views.pixel_size import LEAST_VIEWS, pixel_size, views_for
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel

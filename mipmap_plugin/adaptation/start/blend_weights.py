@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.parallel import max_threads, together
-from mipmap_plugin.adaptation.pixel_size import pictured
 from mipmap_plugin.adaptation.start.closed_form import filter_variance
+from mipmap_plugin.adaptation.views.pixel_size import pictured
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects, colorless

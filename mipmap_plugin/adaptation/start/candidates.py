@@ -10,7 +10,6 @@ from typing import cast
 from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.amount import takes_steps
-from mipmap_plugin.adaptation.pixel_size import mean_pixel_size
 from mipmap_plugin.adaptation.start.base_weights import BaseWeights
 from mipmap_plugin.adaptation.start.blend_weights import Wanted
 from mipmap_plugin.adaptation.start.clock import Clock
@@ -19,6 +18,7 @@ from mipmap_plugin.adaptation.start.matching import Matcher
 from mipmap_plugin.adaptation.start.merging import MergingRounds, merge_down, merge_seen
 from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.adaptation.start.thinning import evenly_in_space
+from mipmap_plugin.adaptation.views.pixel_size import mean_pixel_size
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SPLATS, SplatModel, Thinned, means_at
 from mipmap_plugin.models.contract import rebuild, reshape

@@ -17,12 +17,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS
 from mipmap_plugin.adaptation.start.base_weights import BaseWeights
 from mipmap_plugin.adaptation.start.blend_weights import Wanted, blend_weights
 from mipmap_plugin.adaptation.start.clock import Clock
 from mipmap_plugin.adaptation.start.closed_form import filter_suffices
 from mipmap_plugin.adaptation.start.problem import StartProblem
+from mipmap_plugin.adaptation.views.pixel_size import LEAST_VIEWS
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import SURFEL
 from mipmap_plugin.gaussians import Gaussians

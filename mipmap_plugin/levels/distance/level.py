@@ -18,14 +18,15 @@ from mipmap_plugin.adaptation.optimization.amount import fewer_note
 from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Task
-from mipmap_plugin.adaptation.optimization.validation import HARM_DB, Validation, split_validation
-from mipmap_plugin.adaptation.pixel_size import enough_views
+from mipmap_plugin.adaptation.optimization.validation import HARM_DB, Validation
 from mipmap_plugin.adaptation.report import Report, filters, versions
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.compilation import warm_up
 from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
-from mipmap_plugin.adaptation.views import choose_views
+from mipmap_plugin.adaptation.views.for_validation import split_validation
+from mipmap_plugin.adaptation.views.pixel_size import enough_views
+from mipmap_plugin.adaptation.views.policy import choose_views
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Calls
 from mipmap_plugin.camera import Camera, digest_of, evenly

@@ -9,8 +9,8 @@ import tiny
 import torch
 from brief_runs import is_finite, shrunk
 
-from mipmap_plugin.adaptation import shown
-from mipmap_plugin.adaptation.shown import far_apart, remarks, worse_views
+from mipmap_plugin.adaptation.views import shown
+from mipmap_plugin.adaptation.views.shown import far_apart, remarks, worse_views
 from mipmap_plugin.camera import Camera, viewmat_of
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.wrap import wrap_model
@@ -111,7 +111,7 @@ def test_a_scene_nearer_than_the_near_plane_is_refused_with_what_to_do():
 
 
 def test_a_scene_in_small_units_is_told_of_where_the_near_plane_keeps_an_orbit_away_from_it(monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 800)
+    monkeypatch.setattr("mipmap_plugin.adaptation.views.policy.ORBIT_PIXELS", 800)
     base = wrap_model(shrunk(0.02))
     where = r"the scene is 0.0\d+ units wide, and no view shows it larger than \S+ px: renderers of 3DGS draw nothing nearer than 0.2 units; "
     where += "scale the scene up, with its cameras if it has any"  # here it has none

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB
 from mipmap_plugin.adaptation.parallel import in_batches
-from mipmap_plugin.adaptation.pixel_size import seen_depth
+from mipmap_plugin.adaptation.views.pixel_size import seen_depth
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.errors import SettingsError, some_of

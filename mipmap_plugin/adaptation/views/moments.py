@@ -10,7 +10,7 @@ from itertools import chain, zip_longest
 
 import torch
 
-from mipmap_plugin.adaptation.following import follows
+from mipmap_plugin.adaptation.optimization.following import follows
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.models.base import SplatModel
 

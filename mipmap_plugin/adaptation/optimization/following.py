@@ -7,7 +7,7 @@ from typing import Any, cast
 
 from torch import Tensor
 
-from mipmap_plugin.adaptation.pixel_size import target_pixel
+from mipmap_plugin.adaptation.views.pixel_size import target_pixel
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.models.base import SplatModel
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import torch
 
-from mipmap_plugin.adaptation.viewpoints import Viewpoints
+from mipmap_plugin.adaptation.views.viewpoints import Viewpoints
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError, plural
