@@ -44,6 +44,11 @@ class AdaptationRequest:
     budget_share: float = 1.0  # of the time budget that was asked for, which the settings have
     zoom_in: float | None = None  # of a conversion: the scale of the zoom-in that starts from what it returns, so that its state is kept
 
+    @property
+    def has_blend_weights(self) -> bool:
+        """Whether splats are the same for all views, and the backend has the gradients that blend weights need."""
+        return self.has_gradients and self.images.model.traits.same_for_all_views
+
     def fingerprint(self, scale: float, config: AdaptConfig, views: Sequence[Camera]) -> str:
         """A hash of everything that a run to `scale` depends on, so that a state is never resumed as another run."""
         base = digest_of_model(self.images.model) + ("" if self.finer is None else digest_of_parameters(self.finer.model))

@@ -11,7 +11,6 @@ from pathlib import Path
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch
 from mipmap_plugin.adaptation.drawn import Drawn
-from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_trained, psnr_per_viewer, too_far_out, worse_viewers
 from mipmap_plugin.adaptation.optimization.amount import affordable_for_model, affordable_moments, fewer_note, looks_in_budget, takes_steps
 from mipmap_plugin.adaptation.optimization.budget import for_upsampling, no_steps_notes, plan_note, within_budget
 from mipmap_plugin.adaptation.optimization.ending import End
@@ -21,9 +20,9 @@ from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
-from mipmap_plugin.adaptation.optimization.validation import COMPARED_WITH_BASE, HARM_DB, Quality, Validation
+from mipmap_plugin.adaptation.optimization.validation import COMPARED_WITH_BASE, HARM_DB, Quality, Validation, psnr_as_trained, psnr_per_viewer
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, color_limits, views_renderer
-from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, option_note, simulated, versions
+from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, option_note, simulated
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer, ends_run
 from mipmap_plugin.adaptation.start.bands import used_degree, with_more_bands
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
@@ -38,8 +37,9 @@ from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.views.for_validation import WINDOW, split_validation
 from mipmap_plugin.adaptation.views.moments import at_their_moments, evaluate_moments
 from mipmap_plugin.adaptation.views.policy import choose_views, over_band
-from mipmap_plugin.adaptation.views.shown import refuse_blind, remarks, showing, too_unlike, worse_views
+from mipmap_plugin.adaptation.views.shown import refuse_blind, remarks, showing, too_far_out, too_unlike
 from mipmap_plugin.adaptation.warn import warn
+from mipmap_plugin.adaptation.worse import better_as_trained, worse_viewers, worse_views
 from mipmap_plugin.backends.base import Calls
 from mipmap_plugin.camera import ONE_PIXEL, Camera, evenly
 from mipmap_plugin.config import AdaptConfig
@@ -47,6 +47,7 @@ from mipmap_plugin.models.base import SplatModel, count_of, digest_of_model, mea
 from mipmap_plugin.models.health import doubts_in
 from mipmap_plugin.process import pool, threads
 from mipmap_plugin.process.clock import now
+from mipmap_plugin.process.versions import versions
 from mipmap_plugin.progress import announced
 
 
@@ -66,7 +67,6 @@ class Session:
         self.viewpoints = replace(request.viewpoints, looks=looks_in_budget(self.config, self.base))
         self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.device)
         self._has_photographs, self._orbits = photographs is not None, not cameras or config.views == "orbit"
-        self._has_blend_weights = request.has_gradients and self.base.traits.same_for_all_views
         self.base_views, validation, self.views_note = self._choose_views(cameras)
         self.config = config = fitting(self.config, self.drawn.base, self.base_views, scale)
         self.seconds["total"] = sum(self.seconds.values())
@@ -132,7 +132,7 @@ class Session:
 
     def _compile(self, model: SplatModel) -> None:
         """Let the backend compile what the run will call for splats such as the model's, in a phase of its own."""
-        merging, effects = self.config.merge_to < 1 and self._has_blend_weights, (self.drawn.base, *self.drawn.targets.values())
+        merging, effects = self.config.merge_to < 1 and self.request.has_blend_weights, (self.drawn.base, *self.drawn.targets.values())
         with self.phase("compilation"):
             calls = calls_of(self.views, self.scale, self.config, gradients=self._takes_steps, merging=merging, plain=self.base.traits.plain)
             warm_up(self.backend, model.gaussians(self.views[0]), effects, calls)
@@ -140,7 +140,7 @@ class Session:
     def _start_problems(self) -> list[StartProblem]:
         from_base = StartProblem(
             lambda: self.drawn.copied(self.base, shared=True), self.base_views, self._closest_of, self.scale, self.drawn.base,
-            self.drawn.median, self.config, self.backend, self._has_blend_weights, self.quality, self.phase,
+            self.drawn.median, self.config, self.backend, self.request.has_blend_weights, self.quality, self.phase,
             may_lose=self.config.merging_costs if len(self.drawn.targets) > 1 and self.config.steps else 0.0,
         )  # fmt: skip
         if (finer := self.finer) is None:

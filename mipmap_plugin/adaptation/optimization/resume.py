@@ -17,12 +17,12 @@ from mipmap_plugin.adaptation.optimization.run import Run, Task, Trial
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.adaptation.optimization.state_file import StateFile, claim_state_file
 from mipmap_plugin.adaptation.optimization.steering import Steering
-from mipmap_plugin.adaptation.report import versions
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import CheckpointError, OutputError, SettingsError, warn
 from mipmap_plugin.formats.atomic import refuse_output
 from mipmap_plugin.formats.torch_file import load_torch, save_torch
 from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.process.versions import versions
 
 # Seconds between two saved states: the most that a killed process loses. A state is about three times as large as the model, four times
 # with growth on trial.

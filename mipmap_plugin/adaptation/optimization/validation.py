@@ -22,7 +22,9 @@ from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR
 from mipmap_plugin.adaptation.parallel import max_threads, together
 from mipmap_plugin.adaptation.renderers import Renderer
 from mipmap_plugin.adaptation.target.resize import difference_from
+from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.process.threads import side_by_side
@@ -155,6 +157,25 @@ def mean_db(errors: Sequence[float]) -> float:
 def _visible_db(errors: Sequence[float]) -> float:
     """The mean PSNR (dB) over views as far as differences are visible; for good views it hardly changes."""
     return fmean(decibel(error + VISIBLE_ERROR) for error in errors) if errors else 0.0
+
+
+def psnr_per_viewer(validation: Validation, backend: Backend, targets: Mapping[str, Effects], model: SplatModel) -> dict[str, float]:
+    """PSNR (dB) of a model in each viewer on the views that choose among states, where it is made for several; {} for one."""
+    if len(targets) == 1:
+        return {}
+    renders = [Renderer(backend, target) for target in targets.values()]
+    psnrs = replace(validation, renders=renders).viewer_psnrs(model, validation.choosing)
+    return dict(zip(targets, psnrs, strict=True))
+
+
+def psnr_as_trained(validation: Validation, backend: Backend, targets: Mapping[str, Effects], base: SplatModel, effects: Effects) -> float | None:
+    """PSNR (dB) of the base on the same views as its training draws it (`effects`).
+
+    None at x1, where that is the truth itself, and where the file is drawn so too, so that this is the base as it is.
+    """
+    if validation.scale == 1 or not validation.choosing or effects in targets.values():
+        return None
+    return replace(validation, renders=[Renderer(backend, effects)]).viewer_psnrs(base, validation.choosing)[0]
 
 
 def no_validation(truth: Callable[[Camera], Tensor], render: Callable[[Gaussians, Camera], Tensor]) -> Validation:

@@ -19,7 +19,7 @@ from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Task
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, Validation
-from mipmap_plugin.adaptation.report import Report, filters, versions
+from mipmap_plugin.adaptation.report import Report, filters
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.compilation import warm_up
 from mipmap_plugin.adaptation.target.image_store import ImageStore
@@ -41,6 +41,7 @@ from mipmap_plugin.models.base import SplatModel, digest_of_model, digest_of_par
 from mipmap_plugin.models.contract import rebuild
 from mipmap_plugin.models.health import doubts_in
 from mipmap_plugin.process.clock import now
+from mipmap_plugin.process.versions import versions
 from mipmap_plugin.progress import announced
 
 # Samples of the truth per pixel along each side.
