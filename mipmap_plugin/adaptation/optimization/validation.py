@@ -17,8 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.curve import decibel
-from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR
+from mipmap_plugin.adaptation.curve import INVISIBLE_ERROR, decibel
 from mipmap_plugin.adaptation.parallel import max_threads, together
 from mipmap_plugin.adaptation.renderers import Renderer
 from mipmap_plugin.adaptation.target.resize import difference_from

@@ -10,7 +10,6 @@ from itertools import chain, zip_longest
 
 import torch
 
-from mipmap_plugin.adaptation.optimization.following import follows
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.models.base import SplatModel
 
@@ -59,6 +58,11 @@ def at_their_moments(views: Sequence[Camera], validation: Sequence[Camera], most
     before, after = (len({view.time for view in some}) for some in ([*views, *validation[::2]], used))
     paired = [view for view in chain(*zip_longest(steering, choosing)) if view is not None]
     return used[: len(views)], paired, times if after == before else f"{times}, each at the nearest of {after} moments"
+
+
+def follows(base: SplatModel) -> bool:
+    """Whether a moving model keeps the results of its field; one of a third party need not."""
+    return base.traits.moves and hasattr(base, "follow")
 
 
 @torch.no_grad()

@@ -10,7 +10,7 @@ import torch
 from equal_models import SCALE
 
 from mipmap_plugin.adaptation import session
-from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR
+from mipmap_plugin.adaptation.curve import INVISIBLE_ERROR
 from mipmap_plugin.adaptation.optimization.validation import TIE_DB, VISIBLE_ERROR, Validation
 from mipmap_plugin.adaptation.views.for_validation import VALIDATION_EVERY, WINDOW, split_validation
 from mipmap_plugin.adaptation.views.policy import choose_views
