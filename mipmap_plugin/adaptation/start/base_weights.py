@@ -89,7 +89,7 @@ def weighed_in_parts(
     numbers = evenly(range(count), enough(shown))
     if len(numbers) % len(first):  # these are all, and the first ones are not evenly spread among them
         numbers = [*first, *(number for number in numbers if number not in first)]
-    else:  # every so-manieth is one of the first
+    else:  # the first ones are evenly spread among these
         stride = len(numbers) // len(first)
         weights = torch.zeros_like(weights).index_add_(1, torch.arange(PARTS, device=weights.device) * stride % PARTS, weights)
     parts = {number: place % PARTS for place, number in enumerate(numbers) if number not in first}
