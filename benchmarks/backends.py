@@ -25,11 +25,11 @@ from tables import GROWTH, Row, Rows, growth_table, sizes_table, speed_table
 from tqdm import tqdm
 from workloads import Size, Variant, prepare, users_scenes
 
-from mipmap_plugin.adaptation.report import versions
 from mipmap_plugin.backends import survey
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.errors import BackendUnavailable, SettingsError
 from mipmap_plugin.formats.atomic import write_json
+from mipmap_plugin.process.versions import versions
 
 # Imports and compilation are done on this scene before anything is timed.
 WARM_UP: Name = "T"

@@ -31,9 +31,9 @@ from gpu_speed import MODES, Case, Mode
 from gpu_timing import copied_per_second
 from gpu_work import DONE, Work, carry_out
 
-from mipmap_plugin.adaptation.report import versions
 from mipmap_plugin.backends import get_backend, survey
 from mipmap_plugin.backends.base import Needs
+from mipmap_plugin.process.versions import versions
 
 SizeName = Literal["800", "1080p", "4K"]
 Part = Literal["conformance", "speed", "views", "profiles", "adaptation", "viewers"]

@@ -25,7 +25,7 @@ from torch import Tensor
 from mipmap_plugin import Camera, wrap_model
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
-from mipmap_plugin.adaptation.views import choose_views
+from mipmap_plugin.adaptation.views.policy import choose_views
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.evaluation.evaluate import Evaluator, Row, adapted_row

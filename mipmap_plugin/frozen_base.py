@@ -15,16 +15,17 @@ from mipmap_plugin.adaptation import notebook
 from mipmap_plugin.adaptation.adapted import Adapted, as_start, render_model
 from mipmap_plugin.adaptation.choosing import choose, mergeable_settings
 from mipmap_plugin.adaptation.conversion import Stages, conversion
-from mipmap_plugin.adaptation.in_viewers import NearPlanes
+from mipmap_plugin.adaptation.near_planes import NearPlanes
+from mipmap_plugin.adaptation.portable import settings_for_several
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer
-from mipmap_plugin.adaptation.shown import refuse_blind, refuse_large
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import LIMIT, BaseImages
-from mipmap_plugin.adaptation.target.photographs import Photographs, placed, scene_of
-from mipmap_plugin.adaptation.target.portable import settings_for_several
+from mipmap_plugin.adaptation.target.photographs import Photographs, scene_of
 from mipmap_plugin.adaptation.target.upsamplers import network_input
-from mipmap_plugin.adaptation.viewpoints import ClearViews, Viewpoints, orbit_of
-from mipmap_plugin.adaptation.views import choose_views
+from mipmap_plugin.adaptation.views.placing import placed
+from mipmap_plugin.adaptation.views.policy import choose_views
+from mipmap_plugin.adaptation.views.shown import refuse_blind, refuse_large
+from mipmap_plugin.adaptation.views.viewpoints import ClearViews, Viewpoints, orbit_of
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
 from mipmap_plugin.camera import ONE_PIXEL, Camera, checked, digest_of, of_base_scale

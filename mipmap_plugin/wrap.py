@@ -13,10 +13,10 @@ from typing import Any
 from typing_extensions import TypedDict, Unpack
 
 from mipmap_plugin.adaptation.adapted import Adapted as Adapted
-from mipmap_plugin.adaptation.cameras_of_base import own_cameras, where
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
 from mipmap_plugin.adaptation.target.other_world import LOOK, doubt_about
-from mipmap_plugin.adaptation.target.photographs import placed
+from mipmap_plugin.adaptation.views.cameras_of_base import own_cameras, where
+from mipmap_plugin.adaptation.views.placing import placed
 from mipmap_plugin.backends import BACKENDS, device_for
 from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.camera import Camera, digest_of, of_base_scale

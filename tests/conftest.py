@@ -68,7 +68,7 @@ def nothing_that_is_registered_stays():
 @pytest.fixture(autouse=True)
 def small_orbits(monkeypatch):
     """Views of a generated orbit have 24 px, in place of 800: no test of a file without cameras is about its pictures."""
-    monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 24)
+    monkeypatch.setattr("mipmap_plugin.adaptation.views.policy.ORBIT_PIXELS", 24)
 
 
 @pytest.fixture

@@ -11,9 +11,8 @@ from typing import Any
 import torch
 
 from mipmap_plugin.adaptation import notebook
-from mipmap_plugin.adaptation.in_viewers import psnr_per_viewer
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
-from mipmap_plugin.adaptation.optimization.validation import HARM_DB, Validation
+from mipmap_plugin.adaptation.optimization.validation import HARM_DB, Validation, psnr_per_viewer
 from mipmap_plugin.adaptation.parallel import large_for_torch
 from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.adaptation.start.problem import FinerLevel

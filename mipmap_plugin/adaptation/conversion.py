@@ -16,13 +16,13 @@ from pathlib import Path
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
-from mipmap_plugin.adaptation.optimization.validation import count_of_views
 from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer
 from mipmap_plugin.adaptation.session import Session
-from mipmap_plugin.adaptation.shown import orbited, seeing
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.photographs import Photographs
+from mipmap_plugin.adaptation.views.for_validation import count_of_views
+from mipmap_plugin.adaptation.views.shown import orbited, seeing
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import ONE_PIXEL, Camera
 from mipmap_plugin.config import AdaptConfig
@@ -80,8 +80,7 @@ class Stages:
 
     def _in_two(self, scale: float, config: AdaptConfig, first: AdaptConfig, cameras: list[Camera]) -> Adapted:
         """Convert the base with the settings `first`, and adapt what that returns to `scale`."""
-        session = Session(self.request, 1.0, first, cameras, None)
-        session.wanted = scale
+        session = Session(replace(self.request, zoom_in=scale), 1.0, first, cameras, None)
         converted = replace(session.run(self.resume and conversion_state(self.resume), self.observe), judge=None)  # which nobody saves
         stopped = session.ended is End.OBSERVER
         del session  # with the truths of its views

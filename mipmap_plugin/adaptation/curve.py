@@ -9,6 +9,9 @@ from pydantic import BaseModel, ConfigDict
 
 from mipmap_plugin.process.clock import now
 
+# The square of half a step of an 8-bit image: smaller mean square differences are invisible on a display, and hardly count.
+INVISIBLE_ERROR = (0.5 / 255) ** 2
+
 
 class CurvePoint(BaseModel):
     """One point of accuracy against time.

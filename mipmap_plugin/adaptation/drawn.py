@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+from mipmap_plugin.adaptation.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.renderers import Renderer, unrounded
-from mipmap_plugin.adaptation.target.portable import extreme_targets
 from mipmap_plugin.backends.base import Backend, Needs
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.models.base import SplatModel
@@ -34,13 +34,19 @@ class Drawn:
         """The targets that steps draw."""
         return extreme_targets(self.targets)
 
+    @property
+    def median(self) -> Effects:
+        """The target that a start is made for."""
+        return median_target(self.targets)
+
     def renders(self, backend: Backend) -> list[Renderer]:
         """What draws as each of the extremes does."""
         return [Renderer(backend, target) for target in self.extremes.values()]
 
-    def renders_to_step(self, backend: Backend) -> list[Renderer]:
-        """What steps draw with: the same, `unrounded`."""
-        return [Renderer(backend, unrounded(target)) for target in self.extremes.values()]
+    @property
+    def to_step(self) -> list[Effects]:
+        """How steps draw: as the extremes, `unrounded`."""
+        return [*map(unrounded, self.extremes.values())]
 
     def copied(self, model: SplatModel, *, shared: bool = False) -> SplatModel:
         """A copy of a model that is rendered with the target's screen filter; `shared`: with the model's tensors, if it can have these."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import torch
@@ -179,11 +178,3 @@ def option_note(base: SplatModel, scale: float) -> str:
         return ""
     told = f"{option}=[{1 / scale:g}] in its cfg_args, in place of an option for the size of pictures"
     return f"its own project chooses levels of detail for x{scale:g} only with {told}; otherwise it shows this file with those of the training"
-
-
-def versions() -> dict[str, str]:
-    try:
-        own = version("mipmap-plugin")
-    except PackageNotFoundError:  # run from a source tree that was not installed
-        own = "source"
-    return {"mipmap_plugin": own, "torch": str(torch.__version__)}  # plain text, which a state is read with

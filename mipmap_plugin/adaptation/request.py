@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import BaseImages
-from mipmap_plugin.adaptation.viewpoints import Viewpoints
+from mipmap_plugin.adaptation.views.viewpoints import Viewpoints
 from mipmap_plugin.camera import Camera, digest_of
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
@@ -42,6 +42,12 @@ class AdaptationRequest:
     finer: FinerLevel | None = None  # what the run starts from instead of the base
     inputs: Mapping[str, str] = field(default_factory=dict)  # `Report.inputs`
     budget_share: float = 1.0  # of the time budget that was asked for, which the settings have
+    zoom_in: float | None = None  # of a conversion: the scale of the zoom-in that starts from what it returns, so that its state is kept
+
+    @property
+    def has_blend_weights(self) -> bool:
+        """Whether splats are the same for all views, and the backend has the gradients that blend weights need."""
+        return self.has_gradients and self.images.model.traits.same_for_all_views
 
     def fingerprint(self, scale: float, config: AdaptConfig, views: Sequence[Camera]) -> str:
         """A hash of everything that a run to `scale` depends on, so that a state is never resumed as another run."""

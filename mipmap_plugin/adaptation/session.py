@@ -11,35 +11,35 @@ from pathlib import Path
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch
 from mipmap_plugin.adaptation.drawn import Drawn
-from mipmap_plugin.adaptation.following import Following, release
-from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_trained, psnr_per_viewer, too_far_out, worse_viewers
-from mipmap_plugin.adaptation.moments import at_their_moments, evaluate_moments
 from mipmap_plugin.adaptation.optimization.amount import affordable_for_model, affordable_moments, fewer_note, looks_in_budget, takes_steps
 from mipmap_plugin.adaptation.optimization.budget import for_upsampling, no_steps_notes, plan_note, within_budget
 from mipmap_plugin.adaptation.optimization.ending import End
+from mipmap_plugin.adaptation.optimization.following import Following, release
 from mipmap_plugin.adaptation.optimization.growing import growth_note
 from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
-from mipmap_plugin.adaptation.optimization.validation import COMPARED_WITH_BASE, HARM_DB, WINDOW, Quality, Validation, split_validation
+from mipmap_plugin.adaptation.optimization.validation import COMPARED_WITH_BASE, HARM_DB, Quality, Validation, psnr_as_trained, psnr_per_viewer
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, color_limits, views_renderer
-from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, option_note, simulated, versions
+from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, option_note, simulated
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer, ends_run
-from mipmap_plugin.adaptation.shown import refuse_blind, remarks, showing, too_unlike, worse_views
 from mipmap_plugin.adaptation.start.bands import used_degree, with_more_bands
-from mipmap_plugin.adaptation.start.candidates import best_start
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
-from mipmap_plugin.adaptation.start.matcher import UNMATCHED
+from mipmap_plugin.adaptation.start.matching import UNMATCHED
 from mipmap_plugin.adaptation.start.problem import StartProblem
+from mipmap_plugin.adaptation.start.search import best_start
 from mipmap_plugin.adaptation.start.splitting import in_parts
 from mipmap_plugin.adaptation.target.detail import DetailLoss, unused_upsampler
 from mipmap_plugin.adaptation.target.photographs import Photographs
-from mipmap_plugin.adaptation.target.portable import median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views import choose_views, over_band
+from mipmap_plugin.adaptation.views.for_validation import WINDOW, split_validation
+from mipmap_plugin.adaptation.views.moments import at_their_moments, evaluate_moments
+from mipmap_plugin.adaptation.views.policy import choose_views, over_band
+from mipmap_plugin.adaptation.views.shown import refuse_blind, remarks, showing, too_far_out, too_unlike
 from mipmap_plugin.adaptation.warn import warn
+from mipmap_plugin.adaptation.worse import better_as_trained, worse_viewers, worse_views
 from mipmap_plugin.backends.base import Calls
 from mipmap_plugin.camera import ONE_PIXEL, Camera, evenly
 from mipmap_plugin.config import AdaptConfig
@@ -47,6 +47,7 @@ from mipmap_plugin.models.base import SplatModel, count_of, digest_of_model, mea
 from mipmap_plugin.models.health import doubts_in
 from mipmap_plugin.process import pool, threads
 from mipmap_plugin.process.clock import now
+from mipmap_plugin.process.versions import versions
 from mipmap_plugin.progress import announced
 
 
@@ -56,7 +57,6 @@ class Session:
     notes: Sequence[str] = ()  # on what the views show of the base
     ended: End | None = None  # why the steps ended
     state: StateFile | None = None  # of the run, as long as its model is not saved
-    wanted: float | None = None  # where this is a conversion: the scale of the zoom-in that starts from what it returns; so its state is kept
 
     def __init__(self, request: AdaptationRequest, scale: float, config: AdaptConfig, cameras: list[Camera], photographs: Photographs | None) -> None:
         self.request, self.scale, self.finer = request, scale, request.finer
@@ -67,7 +67,6 @@ class Session:
         self.viewpoints = replace(request.viewpoints, looks=looks_in_budget(self.config, self.base))
         self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.device)
         self._has_photographs, self._orbits = photographs is not None, not cameras or config.views == "orbit"
-        self._has_blend_weights = request.has_gradients and self.base.traits.same_for_all_views
         self.base_views, validation, self.views_note = self._choose_views(cameras)
         self.config = config = fitting(self.config, self.drawn.base, self.base_views, scale)
         self.seconds["total"] = sum(self.seconds.values())
@@ -108,13 +107,13 @@ class Session:
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
         """Adapt the base, or continue the run that `resume` holds, and return the best state."""
-        near, wanted = self.drawn.base.near_plane, self.wanted or self.scale
-        refuse_blind(self.base_views, self.base, near, self.truth, wanted)
+        near, final = self.drawn.base.near_plane, self.request.zoom_in or self.scale
+        refuse_blind(self.base_views, self.base, near, self.truth, final)
         if self._base_is_right:
             copy, reason = self.drawn.copied(self.base), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.drawn.effects, self.drawn.targets)
-        found = [too_unlike(self.base_views), too_far_out(self.base, self.base_views, self.drawn.targets), unused_upsampler(self.config, wanted)]
-        for remark in filter(None, [*remarks(self.base_views, self.base, near, orbit=self._orbits), *found, option_note(self.base, wanted)]):
+        found = [too_unlike(self.base_views), too_far_out(self.base, self.base_views, self.drawn.targets), unused_upsampler(self.config, final)]
+        for remark in filter(None, [*remarks(self.base_views, self.base, near, orbit=self._orbits), *found, option_note(self.base, final)]):
             warn(remark)
         began = now(self.device) - self.seconds["total"]
         self._compile(self.base)
@@ -133,7 +132,7 @@ class Session:
 
     def _compile(self, model: SplatModel) -> None:
         """Let the backend compile what the run will call for splats such as the model's, in a phase of its own."""
-        merging, effects = self.config.merge_to < 1 and self._has_blend_weights, (self.drawn.base, *self.drawn.targets.values())
+        merging, effects = self.config.merge_to < 1 and self.request.has_blend_weights, (self.drawn.base, *self.drawn.targets.values())
         with self.phase("compilation"):
             calls = calls_of(self.views, self.scale, self.config, gradients=self._takes_steps, merging=merging, plain=self.base.traits.plain)
             warm_up(self.backend, model.gaussians(self.views[0]), effects, calls)
@@ -141,7 +140,7 @@ class Session:
     def _start_problems(self) -> list[StartProblem]:
         from_base = StartProblem(
             lambda: self.drawn.copied(self.base, shared=True), self.base_views, self._closest_of, self.scale, self.drawn.base,
-            median_target(self.drawn.targets), self.config, self.backend, self._has_blend_weights, self.quality, self.phase,
+            self.drawn.median, self.config, self.backend, self.request.has_blend_weights, self.quality, self.phase,
             may_lose=self.config.merging_costs if len(self.drawn.targets) > 1 and self.config.steps else 0.0,
         )  # fmt: skip
         if (finer := self.finer) is None:
@@ -178,7 +177,7 @@ class Session:
             best = last
         elif self.detail is not None and psnrs[last] >= max(psnrs[name] for name in allowed if name in (base, start)) - HARM_DB:
             best = last  # a network adds detail that the base's own image does not have, so that its gain cannot be measured
-        elif self.detail is None and self.wanted is None:
+        elif self.detail is None and self.request.zoom_in is None:
             means = means_at(self.base, view)
             worse = worse_views(self.validation.choosing, by_view[base], by_view[best], self.scale, means, orbit=self._orbits)
             self.notes = [*self.notes, *worse, *worse_viewers(self.drawn.extremes, by_viewer[base], by_viewer[best])]
@@ -191,11 +190,12 @@ class Session:
         model = states[best].copy() if getattr(states[best], "shares", False) else states[best]
         return Adapted(model, report, self.backend, self.drawn.effects, self.drawn.targets, files, used, judge=self.validation.kept())
 
-    def _task(self, student: SplatModel, renders: Sequence[Renderer]) -> Task:
+    def _task(self, student: SplatModel) -> Task:
         """What is optimized from `student` on: up to how many splats, and by which of the ways to draw them that the backend has."""
-        growth, targets = self.config.most_growth, [renderer.effects for renderer in renders]
+        growth, targets = self.config.most_growth, self.drawn.to_step
+        renders, white = [Renderer(self.backend, target) for target in targets], self.drawn.effects.background == (1.0, 1.0, 1.0)
         return Task(
-            self.views, self.scale, self.truth, renders, self.drawn.effects.background == (1.0, 1.0, 1.0), self.validation, self.detail,
+            self.views, self.scale, self.truth, renders, white, self.validation, self.detail,
             max_splats=self._most_splats if growth is None else min(self._most_splats, int(growth * len(student.parameters()["means"]))),
             render_views=views_renderer(self.backend, targets), color_limits=color_limits(self.drawn.extremes.values()),
             render_to_step=SteppingRenderer.of(self.backend, targets), follow=Following(self.base, self.views, self.scale),
@@ -203,7 +203,6 @@ class Session:
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
         """Run Algorithm 1 on `student`, or continue it from the state in `resume`; return the run and what ended it."""
-        renders = self.drawn.renders_to_step(self.backend)
         keeper = StateKeeper(resume, self.request.fingerprint(self.scale, self.config, self.views))
         if not any(target.sh_degree for target in self.drawn.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no viewer evaluates view-dependent color, so that these coefficients need no gradient
@@ -212,15 +211,16 @@ class Session:
                 self.views = self.detail.prepare(self.views, seconds)
             self.views_note += f", {len(self.views)} of them upsampled"
             self.seconds["total"] += self.seconds["upsampling"]
-        task = self._task(student, renders)
+        task = self._task(student)
         run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
         if run.step and self._draw_bands(run.student, used_degree(run.student)):  # of a start that was merged further than this one
-            task = replace(self._task(run.student, renders := self.drawn.renders_to_step(self.backend)), max_splats=task.max_splats)
+            task = replace(self._task(run.student), max_splats=task.max_splats)
 
         def after_step(run: Run) -> bool:
             keeper.save_if_due(run)
+            render = Renderer(self.backend, self.drawn.to_step[0]).of_model(run.student)
             try:
-                return ends_run(observe and observe(run.step, run.watch.seconds, renders[0].of_model(run.student)))
+                return observe is not None and ends_run(observe(run.step, run.watch.seconds, render))
             except KeyboardInterrupt:  # as between two steps
                 keeper.save_and_stop(run)
 
@@ -228,7 +228,7 @@ class Session:
             task, config = within_budget(run, task, self.config)
             run.ended_by = adapt(run, task, config, keeper.save_and_stop, after_step)
             release(run.student)
-        if self.wanted is not None:
+        if self.request.zoom_in is not None:
             keeper.save(run)
         run.optimizer.state.clear()
         pool.release_to_system()
@@ -238,7 +238,7 @@ class Session:
         self.seconds["optimization"] = run.watch.seconds - self.seconds["total"] - run.costs.seconds()
         self.seconds["total"] = run.watch.seconds
         share, self.ended = self.request.budget_share, run.ended_by
-        self.notes = [*self.notes, *(no_steps_notes(run, self.config, share) if self.wanted is None else [])]
+        self.notes = [*self.notes, *(no_steps_notes(run, self.config, share) if self.request.zoom_in is None else [])]
         told = run.ended_by.told(self.config, run.step, share)
         return run, told + (plan_note(run, self.config) or fewer_note(self.asked.steps, self.config)) + growth_note(run)
 

@@ -174,9 +174,9 @@ def _folder(output: Path) -> Path:
 
 def _hash(wrapped: Wrapped, views: Sequence[Camera], how: tuple[Any, ...]) -> str:
     """A hash of everything that the pictures depend on."""
-    from mipmap_plugin.adaptation.report import versions
     from mipmap_plugin.camera import DIGITS, digest_of
     from mipmap_plugin.models.base import digest_of_model
+    from mipmap_plugin.process.versions import versions
 
     facts = [digest_of_model(wrapped.model), wrapped.asked, str(wrapped.trained), digest_of(views), [view.name for view in views], how, versions()]
     return hashlib.sha256(json.dumps(facts, sort_keys=True, default=str).encode()).hexdigest()[:DIGITS]

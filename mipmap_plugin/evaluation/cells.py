@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mipmap_plugin.adaptation.report import versions
 from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.torch_file import load_torch, save_torch
+from mipmap_plugin.process.versions import versions
 
 
 def made_by(config: AdaptConfig) -> dict[str, Any]:

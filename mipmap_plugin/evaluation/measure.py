@@ -13,10 +13,10 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import Stopwatch
-from mipmap_plugin.adaptation.shown import showing
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import find_upsampler
-from mipmap_plugin.adaptation.views import extent
+from mipmap_plugin.adaptation.views.policy import extent
+from mipmap_plugin.adaptation.views.shown import showing
 from mipmap_plugin.adaptation.warn import silent
 from mipmap_plugin.backends import supersample
 from mipmap_plugin.camera import Camera

@@ -6,7 +6,7 @@ from statistics import fmean
 
 import torch
 
-from mipmap_plugin.adaptation.shown import seeing
+from mipmap_plugin.adaptation.views.shown import seeing
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.errors import plural
 from mipmap_plugin.evaluation.metrics import SAME_DB, psnr

@@ -39,7 +39,7 @@ class Base:
 
     def own_cameras(self) -> Sequence[Camera]:
         """The cameras that are given, or else those that the checkpoint has, without loading it. Raises CheckpointError, SceneError."""
-        from mipmap_plugin.adaptation.cameras_of_base import own_cameras
+        from mipmap_plugin.adaptation.views.cameras_of_base import own_cameras
         from mipmap_plugin.models import detect
 
         folder = self._model_folder()

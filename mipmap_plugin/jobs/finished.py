@@ -9,11 +9,11 @@ from typing import Any
 from pydantic import ValidationError
 
 from mipmap_plugin.adaptation.optimization.amount import as_taken
-from mipmap_plugin.adaptation.target.portable import settings_for_several
+from mipmap_plugin.adaptation.portable import settings_for_several
 from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.target.upsamplers import network_input
-from mipmap_plugin.adaptation.viewpoints import Viewpoints
-from mipmap_plugin.adaptation.views import choose_views
+from mipmap_plugin.adaptation.views.policy import choose_views
+from mipmap_plugin.adaptation.views.viewpoints import Viewpoints
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from mipmap_plugin.adaptation.report import provenance, versions
+from mipmap_plugin.adaptation.report import provenance
 from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.errors import TEMPORARY, MipmapPluginError, SettingsError, plural
 from mipmap_plugin.formats.glb import bytes_before_binary
@@ -23,6 +23,7 @@ from mipmap_plugin.models import contract
 from mipmap_plugin.models.base import SplatModel, digest_of_model
 from mipmap_plugin.models.health import holds_splats
 from mipmap_plugin.models.loaders import for_loader_of, wants_filter
+from mipmap_plugin.process.versions import versions
 from mipmap_plugin.recipes import recipe, scale_of_fraction
 from mipmap_plugin.splatting.viewers import degree_for
 

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.adapted import Adapted
-from mipmap_plugin.adaptation.pixel_size import pixel_size, seen_depth, seen_pixel_size
 from mipmap_plugin.adaptation.report import Report
+from mipmap_plugin.adaptation.views.pixel_size import pixel_size, seen_depth, seen_pixel_size
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.formats.atomic import new_folder, refuse_output, refuse_to_lose, refuse_unwritable, sha256, write_json
 from mipmap_plugin.formats.json_file import read_json

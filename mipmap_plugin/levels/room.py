@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mipmap_plugin.adaptation.pixel_size import seen_pixel_size
+from mipmap_plugin.adaptation.views.pixel_size import seen_pixel_size
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.distance.coarsening import kept_splats
 from mipmap_plugin.levels.distance.ladder import by_distance

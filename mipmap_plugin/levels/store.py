@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from mipmap_plugin.adaptation.adapted import Adapted
-from mipmap_plugin.adaptation.report import Report, versions
+from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.camera import digest_of
 from mipmap_plugin.errors import MipmapPluginError, SettingsError, brief
 from mipmap_plugin.formats.atomic import json_text, refuse_unwritable, settled, sha256, staged, write_json
@@ -21,6 +21,7 @@ from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import Filtered, SplatModel, digest_of_model
 from mipmap_plugin.models.places import MANIFEST, REPORT, STATE, state_path
+from mipmap_plugin.process.versions import versions
 from mipmap_plugin.progress import announced
 
 # Written before the first level: what was broken off earlier leaves the state of a run at most.

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import psnr_as_shown
-from mipmap_plugin.adaptation.optimization.validation import WINDOW
 from mipmap_plugin.adaptation.renderers import Renderer
-from mipmap_plugin.adaptation.shown import showing
 from mipmap_plugin.adaptation.target.resize import filter_for, resize
+from mipmap_plugin.adaptation.views.for_validation import WINDOW
+from mipmap_plugin.adaptation.views.shown import showing
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import ONE_PIXEL, Camera
 from mipmap_plugin.effects import Effects

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 
 from mipmap_plugin.adaptation.adapted import Adapted
-from mipmap_plugin.adaptation.report import versions
 from mipmap_plugin.errors import plural
 from mipmap_plugin.evaluation.evaluate import Row, shown_as
 from mipmap_plugin.evaluation.measure import BASE, RESIZED, baselines
@@ -17,6 +16,7 @@ from mipmap_plugin.evaluation.tradeoff.truth import base_itself, unseen
 from mipmap_plugin.pages.gallery import Gallery, effects_of_base, in_order, recipe_of
 from mipmap_plugin.pages.in_viewers import viewer_pictures, why_not
 from mipmap_plugin.pages.record import Page, Picture, Quality, Role, Zoom, zoom_name
+from mipmap_plugin.process.versions import versions
 from mipmap_plugin.wrap import Wrapped
 
 

@@ -8,17 +8,17 @@ from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.adaptation.curve import CurvePoint
-from mipmap_plugin.adaptation.in_viewers import better_as_trained
 from mipmap_plugin.adaptation.optimization.amount import fewer_note
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.validation import Quality, last_of_best
-from mipmap_plugin.adaptation.report import AS_IT_IS, Report, filters, simulated, versions
-from mipmap_plugin.adaptation.shown import worse_views
+from mipmap_plugin.adaptation.report import AS_IT_IS, Report, filters, simulated
 from mipmap_plugin.adaptation.target.upsamplers import network_input
+from mipmap_plugin.adaptation.worse import better_as_trained, worse_views
 from mipmap_plugin.errors import plural, warn
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.models.loaders import unread
+from mipmap_plugin.process.versions import versions
 from mipmap_plugin.tiles.folder import START
 from mipmap_plugin.tiles.scene import TiledScene
 from mipmap_plugin.tiles.start import errors_of

@@ -13,10 +13,9 @@ from typing import Any
 
 import torch
 
-from mipmap_plugin.adaptation.in_viewers import too_far_out
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report
-from mipmap_plugin.adaptation.shown import refuse_blind, remarks, too_unlike
 from mipmap_plugin.adaptation.target.detail import unused_upsampler
+from mipmap_plugin.adaptation.views.shown import refuse_blind, remarks, too_far_out, too_unlike
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.camera import Camera

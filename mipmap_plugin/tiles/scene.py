@@ -12,11 +12,11 @@ from typing import Any
 from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.amount import affordable_for
-from mipmap_plugin.adaptation.optimization.validation import split_validation
-from mipmap_plugin.adaptation.shown import orbited, seeing, showing
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.viewpoints import Viewpoints, orbit_of
-from mipmap_plugin.adaptation.views import choose_views
+from mipmap_plugin.adaptation.views.for_validation import split_validation
+from mipmap_plugin.adaptation.views.policy import choose_views
+from mipmap_plugin.adaptation.views.shown import orbited, seeing, showing
+from mipmap_plugin.adaptation.views.viewpoints import Viewpoints, orbit_of
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.camera import Camera

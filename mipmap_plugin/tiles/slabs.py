@@ -13,8 +13,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.start.blend_weights import SHOWN
-from mipmap_plugin.adaptation.start.matching import PARTS
+from mipmap_plugin.adaptation.start.blend_weights import PARTS, SHOWN
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects, colorless

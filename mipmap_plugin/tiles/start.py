@@ -10,15 +10,15 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.validation import Quality
-from mipmap_plugin.adaptation.pixel_size import pixel_size
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.base_weights import note_on_hidden, weighed_in_parts
-from mipmap_plugin.adaptation.start.blend_weights import may_show, wanted_of, whole_weights
-from mipmap_plugin.adaptation.start.candidates import start_name
+from mipmap_plugin.adaptation.start.blend_weights import Wanted, may_show, wanted_of, whole_weights
 from mipmap_plugin.adaptation.start.closed_form import LEAST_AXIS, FormSettings, closed_form, draws_alike, filter_suffices
-from mipmap_plugin.adaptation.start.matching import Wanted, matched_opacities, sweeps_over
+from mipmap_plugin.adaptation.start.matching import matched_opacities, sweeps_over
 from mipmap_plugin.adaptation.start.merging import merge_down, merge_seen
+from mipmap_plugin.adaptation.start.search import MERGED_SPLATS, start_name
 from mipmap_plugin.adaptation.start.strength import Bounds, Candidate, Merger, MergingCosts
+from mipmap_plugin.adaptation.views.pixel_size import pixel_size
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.formats.torch_file import save_torch
@@ -60,7 +60,7 @@ class StartSearch:
             self.forms, formed = False, base
         bounds = Bounds(formed.psnr - config.merging_costs, base.visible, formed.psnr)
         if config.merge_to < 1 and (merged := self._merger(weights).strongest(bounds)):
-            return self._take(merged.made, start_name(self.forms, merged=True), merged.quality)
+            return self._take(merged.made, start_name(self.forms, MERGED_SPLATS), merged.quality)
         if not self.forms or formed.visible < base.visible:
             return self._take_base(base)
         self._take(FORMED, start_name(self.forms), formed)

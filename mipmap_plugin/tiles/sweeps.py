@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from mipmap_plugin.adaptation.schedule import ViewSchedule
+from mipmap_plugin.adaptation.views.schedule import ViewSchedule
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.pixel_size import pixel_size
+from mipmap_plugin.adaptation.views.pixel_size import pixel_size
 from mipmap_plugin.camera import Camera, evenly, viewmat_of
 from mipmap_plugin.effects import NEAR_PLANE
 from mipmap_plugin.errors import SettingsError

@@ -17,13 +17,13 @@ from mipmap_plugin import load_model, load_scene, wrap_model
 from mipmap_plugin.adaptation.optimization import run
 from mipmap_plugin.adaptation.optimization.losses import compare
 from mipmap_plugin.adaptation.optimization.validation import Validation
-from mipmap_plugin.adaptation.pixel_size import mean_pixel_size
-from mipmap_plugin.adaptation.shown import remarks, showing
 from mipmap_plugin.adaptation.start import merging
 from mipmap_plugin.adaptation.start.blend_weights import may_show
 from mipmap_plugin.adaptation.start.closed_form import closed_form
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
+from mipmap_plugin.adaptation.views.pixel_size import mean_pixel_size
+from mipmap_plugin.adaptation.views.shown import remarks, showing
 from mipmap_plugin.backends import gsplat, inria
 from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.backends.cpu import nearest_along

@@ -7,7 +7,7 @@ from captures import Row, main
 from made_captures import CAPTURES
 from rows import joined
 
-from mipmap_plugin.adaptation.shown import showing
+from mipmap_plugin.adaptation.views.shown import showing
 from mipmap_plugin.evaluation.measure import views_seen
 from mipmap_plugin.formats.atomic import write_json
 

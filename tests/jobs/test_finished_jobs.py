@@ -8,7 +8,7 @@ import pytest
 import tiny
 from small_jobs import job_of
 
-from mipmap_plugin.adaptation.optimization.validation import MIN_VIEWS
+from mipmap_plugin.adaptation.views.for_validation import MIN_VIEWS
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.finished import finished
 from mipmap_plugin.jobs.run import run as run_job

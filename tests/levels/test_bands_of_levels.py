@@ -14,7 +14,7 @@ from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.image_store import STEPS
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import resize
-from mipmap_plugin.adaptation.views import over_band
+from mipmap_plugin.adaptation.views.policy import over_band
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects

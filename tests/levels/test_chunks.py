@@ -11,7 +11,7 @@ from levels_by_distance import from_x, with_background, wrapped
 from torch.overrides import TorchFunctionMode
 
 from mipmap_plugin import wrap_model
-from mipmap_plugin.adaptation.pixel_size import seen_pixel_size
+from mipmap_plugin.adaptation.views.pixel_size import seen_pixel_size
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects

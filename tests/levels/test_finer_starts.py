@@ -9,7 +9,9 @@ import torch
 from brief_levels import BRIEF, wrapped
 
 from mipmap_plugin.adaptation.optimization.validation import Quality
-from mipmap_plugin.adaptation.start import candidates
+from mipmap_plugin.adaptation.start import search
+from mipmap_plugin.adaptation.start.base_weights import BaseWeights
+from mipmap_plugin.adaptation.start.candidates import Candidates
 from mipmap_plugin.adaptation.start.clock import start_clock
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.effects import Effects
@@ -33,8 +35,8 @@ def test_a_run_starts_from_a_finer_level_and_keeps_a_fraction_of_the_base():
 
 def test_splats_that_share_no_pixel_are_merged_where_enough_is_left_to_see(monkeypatch):
     def count(least_db):
-        monkeypatch.setattr(candidates, "LEAST_DB", least_db)
-        monkeypatch.setattr(candidates.StartSearch, "_least_psnr", lambda *_: -math.inf)
+        monkeypatch.setattr(search, "LEAST_DB", least_db)
+        monkeypatch.setattr(search.StartSearch, "_least_psnr", lambda *_: -math.inf)
         settings = dict(steps=0, merge_to=0.05, merging_costs=99, validation_views=2, returns="last")
         return len(base.adapt(0.9, viewer="antialiased", start=FinerLevel(base.model, 1.0), **settings).model)
 
@@ -60,7 +62,7 @@ def test_what_is_merged_too_coarsely_leaves_the_choice_to_plain_merging(monkeypa
     def quality(model):
         return Quality(*[{"finer": 38.0, "base": base_db, "formed": 34.0}.get(model[0], coarse_db if model[-1] else 33.0)] * 2)
 
-    def candidate(_, weights, fraction, coarsely=False):
+    def candidate(_, fraction=1.0, coarsely=False):
         return Base(("formed",) if fraction == 1 else ("merged", fraction, coarsely))
 
     class Base(tuple):
@@ -76,9 +78,9 @@ def test_what_is_merged_too_coarsely_leaves_the_choice_to_plain_merging(monkeypa
         base=lambda: Base(["finer"]), coarse_base=lambda: Base(["base"]), config=config, quality=quality, may_lose=9.0, name="the finer level",
         views=[], scale=0.5, phase=lambda _: nullcontext(), base_effects=Effects(0), target=Effects(0), has_blend_weights=False,
     )  # fmt: skip
-    monkeypatch.setattr(candidates.BaseWeights, "measured", lambda *_: None)
-    monkeypatch.setattr(candidates.StartSearch, "_candidate", candidate)
-    assert candidates.StartSearch(problem, start_clock(problem)).best()[0] == start
+    monkeypatch.setattr(BaseWeights, "measured", lambda *_: None)
+    monkeypatch.setattr(Candidates, "make", candidate)
+    assert search.StartSearch(problem, start_clock(problem)).best()[0] == start
 
 
 def test_a_start_has_to_be_finer():
@@ -97,7 +99,8 @@ def test_at_most_so_many_splats_are_left_whatever_it_costs(most):
     assert "the base as it is" in adapted.report.validation and not adapted.report.returned.startswith("the base as it is")
 
 
-def test_a_count_above_the_bases_changes_nothing():
-    options = dict(viewer="antialiased", steps=0, validation_views=2, merge_to=1.0)
-    one, other = (wrapped().adapt(1 / 2, **options, **more).model.parameters() for more in ({}, {"most_splats": 12}))
-    assert all(torch.equal(one[name], other[name]) for name in one)
+def test_a_count_above_the_bases_merges_nothing_and_says_so():
+    options = dict(viewer="antialiased", steps=0, validation_views=2)
+    one, other = (wrapped().adapt(1 / 2, **options, **more) for more in ({"merge_to": 1.0}, {"merge_to": 0.5, "most_splats": 12}))
+    assert one.report.validation == other.report.validation and "merging" not in other.report.seconds
+    assert all(torch.equal(tensor, other.model.parameters()[name]) for name, tensor in one.model.parameters().items())

@@ -11,6 +11,7 @@ from levels_by_distance import with_background, wrapped
 from pages_read import record_of
 
 from mipmap_plugin import cli, load_model, wrap_model
+from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.validation import Validation
 from mipmap_plugin.commands.levels import print_summary
 from mipmap_plugin.errors import SettingsError
@@ -90,6 +91,19 @@ def test_a_level_that_no_step_betters_is_not_merged_at_any_cost(small_chunks, mo
     assert told == name
     if name == AS_FINER:
         assert torch.equal(student.parameters()["means"], first.parameters()["means"])
+
+
+def test_centers_move_by_pixels_of_the_level(small_chunks, monkeypatch):
+    """And not by those at the median splat, which may be far away and not move."""
+    base, options, pixels = wrapped(), dict(by="distance", coarsest=1 / 4, ratio=2.0, **BRIEF), []
+
+    def noted(model, config, pixel):
+        pixels.append(pixel)
+        return make_optimizer(model, config, pixel)
+
+    monkeypatch.setattr("mipmap_plugin.adaptation.optimization.run.make_optimizer", noted)
+    rule = base.levels("classic", **options).contents.scene.rule
+    assert pixels[-2:] == [rule.middle(1), rule.middle(2)]
 
 
 def test_a_level_keeps_no_pictures_when_it_is_made(small_chunks, monkeypatch):

@@ -7,7 +7,7 @@ import tiny
 import torch
 from levels_by_distance import from_x, with_background
 
-from mipmap_plugin.adaptation.pixel_size import pixel_size
+from mipmap_plugin.adaptation.views.pixel_size import pixel_size
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance.chunks import Chunks

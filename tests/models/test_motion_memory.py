@@ -11,9 +11,9 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.following import Following, release
-from mipmap_plugin.adaptation.moments import at_moments, at_their_moments, evaluate_moments
-from mipmap_plugin.adaptation.start.candidates import StartSearch
+from mipmap_plugin.adaptation.optimization.following import Following, release
+from mipmap_plugin.adaptation.start.search import StartSearch
+from mipmap_plugin.adaptation.views.moments import at_moments, at_their_moments, evaluate_moments
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import Traits
 from mipmap_plugin.models.moving import memory

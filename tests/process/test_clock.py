@@ -9,10 +9,10 @@ import torch
 
 from mipmap_plugin.adaptation.optimization.costs import Costs
 from mipmap_plugin.adaptation.optimization.validation import Quality
-from mipmap_plugin.adaptation.start import candidates
 from mipmap_plugin.adaptation.start import clock as clock_module
-from mipmap_plugin.adaptation.start.candidates import best_start
+from mipmap_plugin.adaptation.start import search
 from mipmap_plugin.adaptation.start.clock import Clock
+from mipmap_plugin.adaptation.start.search import best_start
 from mipmap_plugin.process.clock import now
 
 GPU = torch.device("cuda")
@@ -87,7 +87,7 @@ def test_a_further_start_has_the_time_that_the_first_has_left(monkeypatch):
             return None, "the start"
 
     monkeypatch.setattr(clock_module, "now", lambda device: seconds[0])
-    monkeypatch.setattr(candidates, "StartSearch", Search)
+    monkeypatch.setattr(search, "StartSearch", Search)
     quality, config = Quality(0.0, 0.0), SimpleNamespace(time_budget_s=20.0)
     best_start([SimpleNamespace(base=tiny.model, config=config, coarse_base=None, quality=lambda _: quality)] * 2)
     assert allowed == [True, False]

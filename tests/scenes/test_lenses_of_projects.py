@@ -11,7 +11,7 @@ from largest import Largest
 from PIL import Image
 from torch_checkpoints import gsplat_folder, splatfacto_folder, splats
 
-from mipmap_plugin.adaptation.target.photographs import placed
+from mipmap_plugin.adaptation.views.placing import placed
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.hosts import Capture, held_out
 from mipmap_plugin.scenes import Scene, load_scene, read_cameras, write_cameras

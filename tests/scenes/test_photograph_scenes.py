@@ -9,9 +9,9 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from mipmap_plugin import wrap_model
-from mipmap_plugin.adaptation.optimization.validation import split_validation
-from mipmap_plugin.adaptation.viewpoints import Viewpoints
-from mipmap_plugin.adaptation.views import choose_views
+from mipmap_plugin.adaptation.views.for_validation import split_validation
+from mipmap_plugin.adaptation.views.policy import choose_views
+from mipmap_plugin.adaptation.views.viewpoints import Viewpoints
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.evaluation.tradeoff.truth import base_itself, unseen
 from mipmap_plugin.levels.yardstick import Yardstick

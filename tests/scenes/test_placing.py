@@ -10,7 +10,7 @@ import tiny
 import torch
 from torch_checkpoints import gsplat_folder, normalized_by_numpy, splatfacto_folder, splats
 
-from mipmap_plugin.adaptation.target.photographs import placed
+from mipmap_plugin.adaptation.views.placing import placed
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
 from mipmap_plugin.effects import Effects

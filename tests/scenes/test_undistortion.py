@@ -9,7 +9,7 @@ import torch
 from colmap_files import names, write_text_model
 from torch_checkpoints import gsplat_folder, splats
 
-from mipmap_plugin.adaptation.target.photographs import placed
+from mipmap_plugin.adaptation.views.placing import placed
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError, SettingsError
 from mipmap_plugin.evaluation import protocols

@@ -9,10 +9,10 @@ import torch
 from cut_scenes import config, cut_in_three
 
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, TIE_DB, Quality
-from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS
-from mipmap_plugin.adaptation.schedule import ViewSchedule
-from mipmap_plugin.adaptation.start.matching import PARTS
+from mipmap_plugin.adaptation.start.blend_weights import PARTS
 from mipmap_plugin.adaptation.start.strength import Merger
+from mipmap_plugin.adaptation.views.pixel_size import LEAST_VIEWS
+from mipmap_plugin.adaptation.views.schedule import ViewSchedule
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel

@@ -11,7 +11,7 @@ import tiny
 import torch
 
 from mipmap_plugin import wrap_model
-from mipmap_plugin.adaptation.moments import at_moments
+from mipmap_plugin.adaptation.views.moments import at_moments
 from mipmap_plugin.viewing import adapting
 from mipmap_plugin.viewing import page as live_page
 from mipmap_plugin.viewing.adapting import Progress

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import torch
 
-from mipmap_plugin.adaptation.optimization.validation import MIN_VIEWS
+from mipmap_plugin.adaptation.views.for_validation import MIN_VIEWS
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects

@@ -14,12 +14,12 @@ from pathlib import Path
 import torch
 
 from mipmap_plugin.adaptation.curve import Stopwatch
-from mipmap_plugin.adaptation.following import Following
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
+from mipmap_plugin.adaptation.optimization.following import Following
 from mipmap_plugin.adaptation.optimization.run import Run, Task
-from mipmap_plugin.adaptation.optimization.validation import WINDOW
 from mipmap_plugin.adaptation.target.pseudo_truth import resolution
+from mipmap_plugin.adaptation.views.for_validation import WINDOW
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import plural

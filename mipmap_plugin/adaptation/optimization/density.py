@@ -8,8 +8,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.following import keep_rows
 from mipmap_plugin.adaptation.optimization.adam import Adam
+from mipmap_plugin.adaptation.optimization.following import keep_rows
 from mipmap_plugin.adaptation.optimization.optimizer import change_rows
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig

@@ -14,7 +14,7 @@ from mipmap_plugin.adaptation.optimization.checks import checks_until
 from mipmap_plugin.adaptation.optimization.costs import Costs
 from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.optimization.run import Run, Task
-from mipmap_plugin.adaptation.schedule import ViewSchedule
+from mipmap_plugin.adaptation.views.schedule import ViewSchedule
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import plural
 from mipmap_plugin.progress import Bar

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from mipmap_plugin.adaptation.following import Following
+from mipmap_plugin.adaptation.optimization.following import Following
 from mipmap_plugin.adaptation.optimization.optimizer import decayed
 from mipmap_plugin.adaptation.optimization.steering import warmed_up
 from mipmap_plugin.config import AdaptConfig

@@ -16,7 +16,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.optimization import density
 from mipmap_plugin.adaptation.optimization.optimizer import restore_parameters
 from mipmap_plugin.adaptation.optimization.run import Run, Task
-from mipmap_plugin.adaptation.views import extent
+from mipmap_plugin.adaptation.views.policy import extent
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.limits import derived_seed
 from mipmap_plugin.models.contract import row_opacities

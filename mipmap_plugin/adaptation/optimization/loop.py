@@ -23,7 +23,7 @@ from mipmap_plugin.adaptation.optimization.losses import compare
 from mipmap_plugin.adaptation.optimization.optimizer import set_rates
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.parallel import large_for_torch, max_threads, together, views_at_once
-from mipmap_plugin.adaptation.schedule import ViewSchedule
+from mipmap_plugin.adaptation.views.schedule import ViewSchedule
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.process.threads import side_by_side
@@ -43,7 +43,6 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     step and after each step; its time is not counted, and the run ends if it returns True.
     """
     order = ViewSchedule(task.views, config)
-    run.costs.motion = lambda: task.follow.seconds
     bar = StepsBar.of(run, task, config, order)
     with bar, ticking(bar), interruptible() as interrupted:
         reason = End.OBSERVER if observe(run) else run.reason_to_stop(config)

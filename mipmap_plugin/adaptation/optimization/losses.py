@@ -7,14 +7,12 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.curve import INVISIBLE_ERROR
 from mipmap_plugin.adaptation.target.resize import difference_from, gradient_before
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 
 Detail = Callable[[Camera, Tensor], Tensor]  # a view and its image -> a further part of the loss
-
-# The square of half a step of an 8-bit image: smaller mean square differences are invisible on a display, and hardly count.
-INVISIBLE_ERROR = (0.5 / 255) ** 2
 
 # A display shows white, 1, at most: what is brighter, as a sky may be by far, would outweigh all else. At zoom-out so much of it counts, as otherwise
 # steps leave colors too bright for views that they did not see: lego and chair lose 1.7 and 2.6 dB at x1/4. At zoom-in nothing does. Beside an edge

@@ -17,12 +17,12 @@ from mipmap_plugin.adaptation.optimization.run import Run, Task, Trial
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.adaptation.optimization.state_file import StateFile, claim_state_file
 from mipmap_plugin.adaptation.optimization.steering import Steering
-from mipmap_plugin.adaptation.report import versions
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import CheckpointError, OutputError, SettingsError, warn
 from mipmap_plugin.formats.atomic import refuse_output
 from mipmap_plugin.formats.torch_file import load_torch, save_torch
 from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.process.versions import versions
 
 # Seconds between two saved states: the most that a killed process loses. A state is about three times as large as the model, four times
 # with growth on trial.
@@ -65,7 +65,7 @@ class StateKeeper:
                 self._release()
                 raise
         try:
-            return load_run(state, student, config)
+            return load_run(state, student, task, config)
         except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError) as error:
             if others := _of_another_version(state):
                 raise SettingsError(f"{self._path}: this state {others}, or delete it to start anew") from error
@@ -147,7 +147,7 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
     save_torch(path, state, overwrite=True)
 
 
-def load_run(state: dict[str, Any], student: SplatModel, config: AdaptConfig) -> Run:
+def load_run(state: dict[str, Any], student: SplatModel, task: Task, config: AdaptConfig) -> Run:
     """Return the run of a state that `save_run` wrote; its parameters replace those of `student`.
 
     Raises what an incomplete state makes Python and torch raise: KeyError, TypeError, ValueError, ...
@@ -171,7 +171,8 @@ def load_run(state: dict[str, Any], student: SplatModel, config: AdaptConfig) ->
     return Run(
         student, optimizer, Stopwatch(seconds=state["seconds"]), gradients, steering, _trial(state["trial"], device), state["step"],
         [CurvePoint(**point) for point in state["curve"]], state["square_error"], state["rows_changed"],
-        Costs(earlier=tuple(state["costs"]), device=device), End(state["ended_by"]) if state["ended_by"] else None,
+        Costs(earlier=tuple(state["costs"]), motion=lambda: task.follow.seconds, device=device),
+        End(state["ended_by"]) if state["ended_by"] else None,
         reserved=state["reserved"], planned=state["planned"],
     )  # fmt: skip
 

@@ -12,20 +12,20 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel
-from mipmap_plugin.adaptation.following import Following
 from mipmap_plugin.adaptation.optimization.adam import Adam
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.costs import Costs
 from mipmap_plugin.adaptation.optimization.density import ScreenGradients
 from mipmap_plugin.adaptation.optimization.ending import End
+from mipmap_plugin.adaptation.optimization.following import Following
 from mipmap_plugin.adaptation.optimization.losses import Detail
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.quickest import QuickestThreads
 from mipmap_plugin.adaptation.optimization.steering import Steering
 from mipmap_plugin.adaptation.optimization.validation import Validation
-from mipmap_plugin.adaptation.pixel_size import target_pixel
 from mipmap_plugin.adaptation.renderers import SteppingRenderer, ViewsRenderer
 from mipmap_plugin.adaptation.target.resize import difference_from
+from mipmap_plugin.adaptation.views.pixel_size import target_pixel
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.gaussians import Gaussians
@@ -52,6 +52,7 @@ class Task:
     follow: Following = field(default_factory=Following)  # called before each step
     color_limits: tuple[float, float] | None = None  # of the coefficients of SH degree 0, which a step leaves within them
     part: str = ""  # of a scene, such as a tile or a level by distance, whose views are of another scale
+    pixel: float | None = None  # world units: the means move by such; None: by the pixel of the new scale at the median splat
 
     @cached_property
     def cameras(self) -> Mapping[Camera, Camera]:
@@ -113,7 +114,8 @@ class Run:
     def start(cls, student: SplatModel, task: Task, config: AdaptConfig, spent: float = 0.0) -> Run:
         """A run before its first step; `spent`: the seconds used so far."""
         means = student.parameters()["means"]
-        optimizer, watch = make_optimizer(student, config, target_pixel(student, task.views, task.scale)), Stopwatch(seconds=spent)
+        pixel = target_pixel(student, task.views, task.scale) if task.pixel is None else task.pixel
+        optimizer, watch = make_optimizer(student, config, pixel), Stopwatch(seconds=spent)
         with watch:
             trial = Trial(task.agreement(student, config)) if config.densify_on_trial and config.densify_gradient is not None else None
             costs = Costs(motion=lambda: task.follow.seconds, device=means.device)

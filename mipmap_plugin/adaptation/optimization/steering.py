@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mipmap_plugin.adaptation.curve import decibel
-from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR
+from mipmap_plugin.adaptation.curve import INVISIBLE_ERROR, decibel
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, TIE_DB, VISIBLE_ERROR
 from mipmap_plugin.config import AdaptConfig

@@ -17,42 +17,19 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.curve import decibel
-from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR
+from mipmap_plugin.adaptation.curve import INVISIBLE_ERROR, decibel
 from mipmap_plugin.adaptation.parallel import max_threads, together
 from mipmap_plugin.adaptation.renderers import Renderer
 from mipmap_plugin.adaptation.target.resize import difference_from
-from mipmap_plugin.adaptation.viewpoints import Viewpoints
-from mipmap_plugin.adaptation.views import choose_views
-from mipmap_plugin.camera import Camera, evenly
-from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.backends.base import Backend
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.process.threads import side_by_side
-from mipmap_plugin.scenes.trajectories import jittered, with_company
-
-# At most one in this many of the given cameras is kept for validation, where the policy leaves the choice of views to us.
-VALIDATION_EVERY = 16
-
-# One validation view per this many rendered views, so that validation takes at most a tenth of the time; but at least `MIN_VIEWS`.
-RENDERS_PER_VIEW = 25
-MIN_VIEWS = 4
-
-# At least as many where no step is taken: nothing makes up for a start that is chosen wrongly. With 4, of which one or two see little but the sky,
-# an object is left as it is (at x1/4 24.0 dB in place of 28.1, at x2 38.7 in place of 43.1), and 8 take 0.1 to 0.8 s more.
-MIN_VIEWS_OF_START = 8
 
 # A zoom-in is validated against the base's own image, whatever it is adapted to.
 COMPARED_WITH_BASE = {"compare_at": "base", "quantize_truth": False}
-
-# px: validation uses at most this much of a view along each side, so that large images stay cheap.
-WINDOW = 768
-
-# Of a number of pixels that is a whole one, as of a third.
-ROUNDING = 1e-6
-
-# Added to the seed for the random views of validation, so that they differ from the views that are adapted to.
-SEED_OFFSET = 7919
 
 # dB: a state that is worse than the start by more than this is undone. Rounding and the choice of views make smaller differences.
 HARM_DB = 0.1
@@ -181,56 +158,25 @@ def _visible_db(errors: Sequence[float]) -> float:
     return fmean(decibel(error + VISIBLE_ERROR) for error in errors) if errors else 0.0
 
 
+def psnr_per_viewer(validation: Validation, backend: Backend, targets: Mapping[str, Effects], model: SplatModel) -> dict[str, float]:
+    """PSNR (dB) of a model in each viewer on the views that choose among states, where it is made for several; {} for one."""
+    if len(targets) == 1:
+        return {}
+    renders = [Renderer(backend, target) for target in targets.values()]
+    psnrs = replace(validation, renders=renders).viewer_psnrs(model, validation.choosing)
+    return dict(zip(targets, psnrs, strict=True))
+
+
+def psnr_as_trained(validation: Validation, backend: Backend, targets: Mapping[str, Effects], base: SplatModel, effects: Effects) -> float | None:
+    """PSNR (dB) of the base on the same views as its training draws it (`effects`).
+
+    None at x1, where that is the truth itself, and where the file is drawn so too, so that this is the base as it is.
+    """
+    if validation.scale == 1 or not validation.choosing or effects in targets.values():
+        return None
+    return replace(validation, renders=[Renderer(backend, effects)]).viewer_psnrs(base, validation.choosing)[0]
+
+
 def no_validation(truth: Callable[[Camera], Tensor], render: Callable[[Gaussians, Camera], Tensor]) -> Validation:
     """Validation without views, for a training, in which no step is undone."""
     return Validation([], [], 1.0, truth, [render], "area")
-
-
-def split_validation(
-    cameras: Sequence[Camera], views: Sequence[Camera], viewpoints: Viewpoints, scale: float, config: AdaptConfig
-) -> tuple[list[Camera], list[Camera]]:
-    """Return the views to adapt to, out of `views`, and the views for validation.
-
-    For validation: some of the given cameras, where a policy chooses among enough of them, and random views from the region that they
-    span; without cameras, the views of another orbit. Of large images only the middle is used; there are no validation views if one
-    pixel of the base is larger than that. `viewpoints`: as of `choose_views`.
-    """
-    if scale > WINDOW:
-        return list(views), []
-    adapted, validation = _validation_views(cameras, views, viewpoints, config)
-    size = _window_side(scale)
-    return adapted, [view.window(size, size) for view in validation]
-
-
-def _window_side(scale: float) -> int:
-    """px of the base: at a zoom-out those of whole pixels of the new scale, which a filter of whole blocks (`box`) needs."""
-    if scale >= 1:
-        return round(WINDOW / scale)
-    return min(WINDOW, round(max(1, math.floor(WINDOW * scale + ROUNDING)) / scale))
-
-
-def count_of_views(config: AdaptConfig) -> int:
-    """How many views there are for validation."""
-    fewest = MIN_VIEWS if config.steps else MIN_VIEWS_OF_START
-    return min(config.validation_views, max(fewest, config.steps * config.views_per_step // RENDERS_PER_VIEW))
-
-
-def _validation_views(
-    cameras: Sequence[Camera], views: Sequence[Camera], viewpoints: Viewpoints, config: AdaptConfig
-) -> tuple[list[Camera], list[Camera]]:
-    """`split_validation` with whole images. Random views come first in each pair, so that they steer and kept cameras choose."""
-    count = count_of_views(config)
-    generator = torch.Generator().manual_seed(config.seed + SEED_OFFSET)
-    if config.views == "orbit" or not cameras:
-        changes = {"views": "orbit", "extra_views": count, "seed": config.seed + SEED_OFFSET}
-        validation, _ = choose_views(cameras, viewpoints, config.model_copy(update=changes))
-        return list(views), validation
-    given = set(cameras)
-    originals = [view for view in views if view in given]
-    kept: list[Camera] = []
-    if config.views in ("train", "jittered"):
-        kept = evenly(originals[VALIDATION_EVERY // 2 :], min(count // 2, len(originals) // VALIDATION_EVERY))
-    adapted = [view for view in views if view not in kept]
-    known = with_company(originals or list(views), viewpoints.orbit)
-    random = jittered(known, count - len(kept), generator, spread=False)
-    return adapted, [view for pair in zip(random, kept, strict=False) for view in pair] + random[len(kept) :]

@@ -7,11 +7,10 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS, pixel_size, views_for
-from mipmap_plugin.adaptation.start.blend_weights import may_show, wanted_of, weighed
+from mipmap_plugin.adaptation.start.blend_weights import PARTS, Wanted, may_show, wanted_of, weighed
 from mipmap_plugin.adaptation.start.clock import Clock
-from mipmap_plugin.adaptation.start.matching import PARTS, Wanted
 from mipmap_plugin.adaptation.start.problem import StartProblem
+from mipmap_plugin.adaptation.views.pixel_size import LEAST_VIEWS, pixel_size, views_for
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
@@ -90,7 +89,7 @@ def weighed_in_parts(
     numbers = evenly(range(count), enough(shown))
     if len(numbers) % len(first):  # these are all, and the first ones are not evenly spread among them
         numbers = [*first, *(number for number in numbers if number not in first)]
-    else:  # every so-manieth is one of the first
+    else:  # the first ones are evenly spread among these
         stride = len(numbers) // len(first)
         weights = torch.zeros_like(weights).index_add_(1, torch.arange(PARTS, device=weights.device) * stride % PARTS, weights)
     parts = {number: place % PARTS for place, number in enumerate(numbers) if number not in first}

@@ -6,14 +6,14 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.parallel import max_threads, together
-from mipmap_plugin.adaptation.pixel_size import pictured
 from mipmap_plugin.adaptation.start.closed_form import filter_variance
-from mipmap_plugin.adaptation.start.matching import PARTS, Wanted
+from mipmap_plugin.adaptation.views.pixel_size import pictured
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects, colorless
@@ -27,6 +27,17 @@ SHOWN = 0.1
 # Fraction of its `whole_weights` below which nothing is known of a splat: no view shows it, or only through gaps. These are 2 to 24 % of a scene,
 # and 61 % of a capture of which one side is shown.
 UNSEEN = 1e-3
+
+# The most parts that views are divided in, of which part k has every PARTS-th view from the k-th on.
+PARTS = 4
+
+
+class Wanted(NamedTuple):
+    """What splats show in the base's images."""
+
+    weights: Tensor  # [N, P] pixels: what each of P parts of the views adds to the mean blend weight over all
+    whole: Tensor  # [N] pixels: the weights of splats that nothing hides (`whole_weights`)
+    areas: Tensor  # [N] px² of the base or the target, whichever has the larger pixels (`areas`)
 
 
 def blend_weights(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects) -> Tensor:
@@ -42,7 +53,7 @@ def weighed(
 ) -> tuple[Tensor, float]:
     """What each part of the views adds to `blend_weights`, [N, P], and the fraction of the splats that a view shows.
 
-    That is the mean over `views`; what is hidden behind others does not count. `parts`: the number of each view's part, below `matching.PARTS`.
+    That is the mean over `views`; what is hidden behind others does not count. `parts`: the number of each view's part, below `PARTS`.
     `size`: a fraction of the views' own, at which they are drawn; the dilation keeps its size in the world.
     """
     total, shown = gaussians.opacities.new_zeros(PARTS, len(gaussians)), torch.zeros_like(gaussians.opacities)

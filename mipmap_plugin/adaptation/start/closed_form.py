@@ -39,8 +39,8 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.parallel import in_batches, in_chunks
-from mipmap_plugin.adaptation.pixel_size import enough_views, mean_pixel_size, pixel_size
 from mipmap_plugin.adaptation.start.surfel_form import visible_area, widened_for_slant, widened_to_filter
+from mipmap_plugin.adaptation.views.pixel_size import enough_views, mean_pixel_size, pixel_size
 from mipmap_plugin.backends.cpu import summed_areas
 from mipmap_plugin.camera import Camera, every_nth
 from mipmap_plugin.effects import SURFEL, Effects

@@ -14,11 +14,11 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.schedule import halves_of, poses, spread
 from mipmap_plugin.adaptation.target.image_store import moved_off_full_gpu
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.structure import similarity
 from mipmap_plugin.adaptation.target.upsamplers import find_upsampler
+from mipmap_plugin.adaptation.views.schedule import halves_of, poses, spread
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.process.clock import now

@@ -9,8 +9,7 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.curve import decibel, psnr_as_shown
-from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR
+from mipmap_plugin.adaptation.curve import INVISIBLE_ERROR, decibel, psnr_as_shown
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.camera import Camera, evenly

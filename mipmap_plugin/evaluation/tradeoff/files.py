@@ -15,13 +15,13 @@ from typing import Any
 import torch
 
 from mipmap_plugin.adaptation.plot import figure_class
-from mipmap_plugin.adaptation.report import versions
 from mipmap_plugin.evaluation.report import markdown
 from mipmap_plugin.evaluation.tradeoff.front import Tradeoff, frames
 from mipmap_plugin.evaluation.tradeoff.plot import OTHERWISE, draw
 from mipmap_plugin.evaluation.tradeoff.points import Point, Spread
 from mipmap_plugin.formats.atomic import new_file, refuse_output, refuse_unwritable, settled, together, write_json
 from mipmap_plugin.models.places import PAGE, page_at
+from mipmap_plugin.process.versions import versions
 
 NAMES = ("tradeoff.json", "tradeoff.csv", "tradeoff.png")
 

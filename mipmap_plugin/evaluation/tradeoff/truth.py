@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.target.resize import resize
-from mipmap_plugin.adaptation.views import choose_views, with_times
+from mipmap_plugin.adaptation.views.moments import with_times
+from mipmap_plugin.adaptation.views.policy import choose_views
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError, plural, warn

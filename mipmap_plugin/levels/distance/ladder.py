@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from mipmap_plugin.adaptation.adapted import Adapted
-from mipmap_plugin.adaptation.pixel_size import seen_pixel_size
+from mipmap_plugin.adaptation.views.pixel_size import seen_pixel_size
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.contents import LeftOut

@@ -18,14 +18,15 @@ from mipmap_plugin.adaptation.optimization.amount import fewer_note
 from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Task
-from mipmap_plugin.adaptation.optimization.validation import HARM_DB, Validation, split_validation
-from mipmap_plugin.adaptation.pixel_size import enough_views
-from mipmap_plugin.adaptation.report import Report, filters, versions
+from mipmap_plugin.adaptation.optimization.validation import HARM_DB, Validation
+from mipmap_plugin.adaptation.report import Report, filters
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.compilation import warm_up
 from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
-from mipmap_plugin.adaptation.views import choose_views
+from mipmap_plugin.adaptation.views.for_validation import split_validation
+from mipmap_plugin.adaptation.views.pixel_size import enough_views
+from mipmap_plugin.adaptation.views.policy import choose_views
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Calls
 from mipmap_plugin.camera import Camera, digest_of, evenly
@@ -40,6 +41,7 @@ from mipmap_plugin.models.base import SplatModel, digest_of_model, digest_of_par
 from mipmap_plugin.models.contract import rebuild
 from mipmap_plugin.models.health import doubts_in
 from mipmap_plugin.process.clock import now
+from mipmap_plugin.process.versions import versions
 from mipmap_plugin.progress import announced
 
 # Samples of the truth per pixel along each side.
@@ -50,16 +52,6 @@ AS_FINER = "the finer level as it is"
 
 # A view is used at least so many times in a run, or else it would not be worth its truth, which costs as much as several steps.
 USES = 6
-
-
-@dataclass(frozen=True)
-class WalkTask(Task):
-    """A task whose rates are in pixels of the level, and not in those at the median splat, which may be far away and not move."""
-
-    size: float = 1.0  # world units
-
-    def pixel(self, model: SplatModel) -> float:
-        return self.size
 
 
 @dataclass(eq=False)
@@ -125,7 +117,8 @@ class LevelRun:
         states = {f"the start, {name}": initial}
         self.seconds["start"] = self.seconds["total"] = now(self.finest.means.device) - began
         if self.config.steps:
-            task = WalkTask(self.views, 1.0, self.truth, [self._render], False, self.validation, part=f"level {self.number}", size=self.size)
+            # The median splat may be far away, where this level is not shown.
+            task = Task(self.views, 1.0, self.truth, [self._render], False, self.validation, part=f"level {self.number}", pixel=self.size)
             keeper = StateKeeper(resume, self._fingerprint())
             run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
             ended_by = adapt(run, task, self.config, keeper.save_and_stop, keeper.save_if_due).told(self.config, run.step)

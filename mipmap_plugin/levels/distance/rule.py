@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.pixel_size import seen_pixel_size
+from mipmap_plugin.adaptation.views.pixel_size import seen_pixel_size
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.levels.request import Band, LadderRequest
 

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.amount import affordable_for
-from mipmap_plugin.adaptation.pixel_size import pixel_size, seen_pixel_size
-from mipmap_plugin.adaptation.shown import seeing
 from mipmap_plugin.adaptation.target.resize import fitting
+from mipmap_plugin.adaptation.views.pixel_size import pixel_size, seen_pixel_size
+from mipmap_plugin.adaptation.views.shown import seeing
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig

@@ -19,7 +19,7 @@ from mipmap_plugin.adaptation.optimization.amount import (
     as_taken,
     splats_in_view,
 )  # fmt: skip
-from mipmap_plugin.adaptation.optimization.validation import MIN_VIEWS
+from mipmap_plugin.adaptation.views.for_validation import MIN_VIEWS
 from mipmap_plugin.models.base import Traits
 from mipmap_plugin.recipes import MOST_DRAWS, recipe
 

@@ -9,11 +9,11 @@ import tiny
 import torch
 
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch
-from mipmap_plugin.adaptation.following import Following
 from mipmap_plugin.adaptation.optimization import budget
 from mipmap_plugin.adaptation.optimization.budget import SPARE, USES, Pace, plan_note, within_budget
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
+from mipmap_plugin.adaptation.optimization.following import Following
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.steering import Steering

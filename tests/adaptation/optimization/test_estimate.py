@@ -8,15 +8,15 @@ import moving
 import pytest
 import tiny
 
-from mipmap_plugin.adaptation.following import Following
 from mipmap_plugin.adaptation.optimization import loop
 from mipmap_plugin.adaptation.optimization.costs import Costs
 from mipmap_plugin.adaptation.optimization.estimate import Forecast
 from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
+from mipmap_plugin.adaptation.optimization.following import Following
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
-from mipmap_plugin.adaptation.schedule import ViewSchedule
 from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.adaptation.views.schedule import ViewSchedule
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.models import load_model

@@ -4,7 +4,8 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.optimization.losses import BEYOND_WHITE, INVISIBLE_ERROR, compare, gradient_of
+from mipmap_plugin.adaptation.curve import INVISIBLE_ERROR
+from mipmap_plugin.adaptation.optimization.losses import BEYOND_WHITE, compare, gradient_of
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.models.vanilla import VanillaModel

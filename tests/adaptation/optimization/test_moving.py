@@ -8,7 +8,7 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.views import with_times
+from mipmap_plugin.adaptation.views.moments import with_times
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.scenes import jittered

@@ -9,8 +9,9 @@ import tiny
 import torch
 from brief_runs import is_finite, shrunk
 
-from mipmap_plugin.adaptation import shown
-from mipmap_plugin.adaptation.shown import far_apart, remarks, worse_views
+from mipmap_plugin.adaptation import worse
+from mipmap_plugin.adaptation.views.shown import far_apart, remarks
+from mipmap_plugin.adaptation.worse import worse_views
 from mipmap_plugin.camera import Camera, viewmat_of
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.wrap import wrap_model
@@ -76,8 +77,8 @@ def test_views_that_lose_are_called_close_ups_where_they_are_less_than_half_as_f
 
 def test_the_report_tells_of_close_ups_that_the_file_suits_less_than_the_base(monkeypatch):
     """As of longer lenses, which show the same in as many pixels."""
-    monkeypatch.setattr(shown, "LONGER", math.inf)
-    monkeypatch.setattr(shown, "CLOSE", 2.0)
+    monkeypatch.setattr(worse, "LONGER", math.inf)
+    monkeypatch.setattr(worse, "CLOSE", 2.0)
     views = [replace(view, fx=times * view.fx, fy=times * view.fy) for view, times in zip(tiny.cameras(8), (1, 8) * 4, strict=True)]
     with pytest.warns(UserWarning, match="the file for x0.25 looks worse than the base.* close-ups"):
         wrap_model(tiny.model(20), cameras=views).adapt(1 / 4, recipe="instant")
@@ -111,7 +112,7 @@ def test_a_scene_nearer_than_the_near_plane_is_refused_with_what_to_do():
 
 
 def test_a_scene_in_small_units_is_told_of_where_the_near_plane_keeps_an_orbit_away_from_it(monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 800)
+    monkeypatch.setattr("mipmap_plugin.adaptation.views.policy.ORBIT_PIXELS", 800)
     base = wrap_model(shrunk(0.02))
     where = r"the scene is 0.0\d+ units wide, and no view shows it larger than \S+ px: renderers of 3DGS draw nothing nearer than 0.2 units; "
     where += "scale the scene up, with its cameras if it has any"  # here it has none

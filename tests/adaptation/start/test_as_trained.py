@@ -10,8 +10,11 @@ import torch
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation.optimization.validation import Quality, mean_db
-from mipmap_plugin.adaptation.start import candidates
+from mipmap_plugin.adaptation.start.base_weights import BaseWeights
+from mipmap_plugin.adaptation.start.candidates import Candidates
 from mipmap_plugin.adaptation.start.clock import start_clock
+from mipmap_plugin.adaptation.start.problem import StartProblem
+from mipmap_plugin.adaptation.start.search import StartSearch
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
@@ -58,13 +61,13 @@ def test_merged_splats_keep_their_shapes_where_the_filter_alone_is_better(monkey
 
     base, antialiased = wrapped("antialiased", 0.3), Effects(0, "antialiased")
     config = base.adapt(1 / 4, recipe="instant").report.settings.model_copy(update={"merge_to": 0.5, "steps": steps})
-    problem = candidates.StartProblem(
+    problem = StartProblem(
         Splats, base.cameras, base.cameras, 1 / 4, antialiased, antialiased, config, ReferenceBackend(), False,
         lambda model: Quality(*[30.0 if model not in reshaped else formed_db] * 2), lambda _: torch.no_grad(),
     )  # fmt: skip
-    monkeypatch.setattr(candidates.BaseWeights, "measured", lambda *_: torch.ones(100))
-    monkeypatch.setattr(candidates.StartSearch, "_merge", lambda *_: torch.ones(50))
-    best, name = candidates.StartSearch(problem, start_clock(problem)).best()
+    monkeypatch.setattr(BaseWeights, "measured", lambda *_: torch.ones(100))
+    monkeypatch.setattr(Candidates, "merge", lambda *_: torch.ones(50))
+    best, name = StartSearch(problem, start_clock(problem)).best()
     assert (best in reshaped) == forms and name == ("the closed form of merged splats" if forms else "merged splats")
 
 

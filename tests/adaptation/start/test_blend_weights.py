@@ -11,8 +11,7 @@ from tiny import cameras, model
 
 from mipmap_plugin.adaptation.start import base_weights
 from mipmap_plugin.adaptation.start.base_weights import BaseWeights, weighed_in_parts
-from mipmap_plugin.adaptation.start.blend_weights import _color_gradient, blend_weights, may_show, wanted_of, weighed, whole_weights
-from mipmap_plugin.adaptation.start.matching import PARTS
+from mipmap_plugin.adaptation.start.blend_weights import PARTS, _color_gradient, blend_weights, may_show, wanted_of, weighed, whole_weights
 from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera, evenly

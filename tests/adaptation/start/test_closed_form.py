@@ -9,8 +9,8 @@ import samples
 import torch
 from discs import DEPTH, PIXEL, VIEW, adapted, disc, seen_from, show
 
-from mipmap_plugin.adaptation.pixel_size import mean_pixel_size, pixel_size
 from mipmap_plugin.adaptation.start.closed_form import MIN_AXIS, FormSettings, closed_form
+from mipmap_plugin.adaptation.views.pixel_size import mean_pixel_size, pixel_size
 from mipmap_plugin.backends.cpu import summed_areas
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.process import threads

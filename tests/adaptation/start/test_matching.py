@@ -9,12 +9,11 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.start import matcher
-from mipmap_plugin.adaptation.start.blend_weights import blend_weights
-from mipmap_plugin.adaptation.start.candidates import StartSearch
+from mipmap_plugin.adaptation.start import matching
+from mipmap_plugin.adaptation.start.blend_weights import Wanted, blend_weights
+from mipmap_plugin.adaptation.start.candidates import Candidates
 from mipmap_plugin.adaptation.start.clock import Clock
-from mipmap_plugin.adaptation.start.matcher import UNMATCHED, Matcher
-from mipmap_plugin.adaptation.start.matching import MAX_FACTOR, PART_PIXELS, SWEEPS, WIDE, Wanted, matched_opacities, sweeps_over
+from mipmap_plugin.adaptation.start.matching import MAX_FACTOR, PART_PIXELS, SWEEPS, UNMATCHED, WIDE, Matcher, matched_opacities, sweeps_over
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -180,16 +179,16 @@ def test_without_steps_opacities_that_come_out_too_faint_are_matched_in_fewer_sw
         swept.append(sweeps)
         return opacities * (factor if sweeps == WHOLE else 1)
 
-    monkeypatch.setattr(matcher, "matched_opacities", matched)
+    monkeypatch.setattr(matching, "matched_opacities", matched)
     found = base.adapt(1 / 4, recipe="instant", merge_to=1.0).model.gaussians(tiny.cameras()[0]).opacities
     assert swept == asked and found.mean() > 1e-2
 
 
 @pytest.mark.parametrize(("screen_filter", "count"), [("classic", 4), ("antialiased", 3)])
 def test_a_filter_that_draws_alike_has_no_closed_form_without_matching(monkeypatch, screen_filter, count):
-    tried, candidate = [], StartSearch._candidate
-    monkeypatch.setattr(StartSearch, "_candidate", lambda *given: tried.append(1) or candidate(*given))
-    monkeypatch.setattr(matcher, "matched_opacities", lambda opacities, *_: opacities * 1e-4)
+    tried, candidate = [], Candidates.make
+    monkeypatch.setattr(Candidates, "make", lambda *given: tried.append(1) or candidate(*given))
+    monkeypatch.setattr(matching, "matched_opacities", lambda opacities, *_: opacities * 1e-4)
     wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference", screen_filter=screen_filter).adapt(1 / 4, recipe="instant", merge_to=1.0)
     assert len(tried) == count
 
@@ -204,7 +203,7 @@ def test_before_steps_opacities_are_matched_once(monkeypatch):
 def opacities_by(monkeypatch, base, factors, **settings):
     """Opacities [N] at x1/4, where each matching multiplies them by the next of these factors; StopIteration if there are too few."""
     left = iter(factors)
-    monkeypatch.setattr(matcher, "matched_opacities", lambda opacities, *_: opacities * next(left))
+    monkeypatch.setattr(matching, "matched_opacities", lambda opacities, *_: opacities * next(left))
     return base.adapt(1 / 4, recipe="instant", merge_to=1.0, **settings).model.gaussians(tiny.cameras()[0]).opacities.detach()
 
 

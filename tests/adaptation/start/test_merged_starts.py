@@ -8,7 +8,7 @@ import torch
 from small_starts import COUNT, SCALE, adapted, start_of
 
 from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
-from mipmap_plugin.adaptation.start import candidates
+from mipmap_plugin.adaptation.start import candidates, search
 from mipmap_plugin.adaptation.start.closed_form import closed_form
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
@@ -29,7 +29,7 @@ def worth(monkeypatch):
             return Quality(*[float(psnr(len(tried) - 1, len(model)))] * 2)
 
         monkeypatch.setattr(Validation, "quality", quality)
-        monkeypatch.setattr(candidates.StartSearch, "_matched_as_shown", lambda self, formed, quality, weights: (formed, quality))
+        monkeypatch.setattr(search.StartSearch, "_matched_as_shown", lambda self, formed, quality: (formed, quality))
         return tried
 
     return give
@@ -132,7 +132,7 @@ def no_time_to_search(monkeypatch, worth):
         return closed_form(gaussians, *rest)
 
     monkeypatch.setattr(candidates, "closed_form", form)
-    monkeypatch.setattr(candidates, "SEARCH_PART", -1.0)
+    monkeypatch.setattr(search, "SEARCH_PART", -1.0)
     worth(lambda _, splats: -splats)
     return formed
 
@@ -141,7 +141,7 @@ IN_TIME = {"time_budget_s": 1000.0, "steps": 2, "merge_to": 0.25}
 
 
 def test_a_budget_too_short_for_a_search_begins_with_what_is_merged_furthest(no_time_to_search, monkeypatch):
-    monkeypatch.setattr(candidates, "REACHED", 3.5)
+    monkeypatch.setattr(search, "REACHED", 3.5)
     report = adapted(**IN_TIME).report
     assert start_of(report) == "the closed form of merged splats"
     assert no_time_to_search == [report.gaussians_after] and report.gaussians_after < COUNT
@@ -153,12 +153,12 @@ def test_a_budget_too_short_for_a_search_begins_with_what_is_merged_furthest(no_
     ids=["splats that can hardly be merged", "few fewer splats", "no steps", "no budget"],
 )
 def test_otherwise_the_base_is_formed_first(no_time_to_search, monkeypatch, reached, settings):
-    monkeypatch.setattr(candidates, "REACHED", reached)
+    monkeypatch.setattr(search, "REACHED", reached)
     adapted(**IN_TIME | settings)
     assert no_time_to_search[0] == COUNT
 
 
 def test_merged_splats_that_are_worse_than_the_base_are_not_begun_with_in_a_short_budget_either(no_time_to_search, worth, monkeypatch):
-    monkeypatch.setattr(candidates, "REACHED", 3.5)
+    monkeypatch.setattr(search, "REACHED", 3.5)
     worth(lambda _, splats: splats)
     assert start_of(adapted(**IN_TIME).report) == "the closed form"

@@ -9,11 +9,11 @@ from small_starts import COUNT, SCALE, adapted, start_of
 
 from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
 from mipmap_plugin.adaptation.parallel import VIEWS_AT_ONCE
-from mipmap_plugin.adaptation.pixel_size import mean_pixel_size, pixel_size
 from mipmap_plugin.adaptation.report import AS_IT_IS, UNCHANGED, Report
 from mipmap_plugin.adaptation.start import base_weights, candidates, compilation
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.closed_form import closed_form
+from mipmap_plugin.adaptation.views.pixel_size import mean_pixel_size, pixel_size
 from mipmap_plugin.backends.base import Calls
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects

@@ -15,9 +15,9 @@ from mipmap_plugin.adaptation.optimization.run import Run
 from mipmap_plugin.adaptation.optimization.steering import Steering
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB
 from mipmap_plugin.adaptation.renderers import Renderer
-from mipmap_plugin.adaptation.start import matcher
-from mipmap_plugin.adaptation.start.candidates import StartSearch
+from mipmap_plugin.adaptation.start import matching
 from mipmap_plugin.adaptation.start.matching import Sweeps
+from mipmap_plugin.adaptation.start.search import StartSearch
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.formats.ply import read_ply
@@ -97,7 +97,7 @@ def test_a_budget_of_nothing_returns_the_start(closed_form, monkeypatch):
     model, settings = wrapped(), dict(merge_to=1.0, closed_form=closed_form)
     adapted = model.adapt(SCALE, time_budget_s=1e-6, **settings)
     assert [point.step for point in adapted.report.curve] == [0]
-    monkeypatch.setattr(matcher, "sweeps_over", lambda _: Sweeps((), ()))  # there is no time to match blend weights
+    monkeypatch.setattr(matching, "sweeps_over", lambda _: Sweeps((), ()))  # there is no time to match blend weights
     assert same(adapted.model, model.adapt(SCALE, steps=0, **settings).model)
     assert same(adapted.model, model.model) != closed_form
 

@@ -10,10 +10,11 @@ import torch
 from equal_models import SCALE
 
 from mipmap_plugin.adaptation import session
-from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR
-from mipmap_plugin.adaptation.optimization.validation import TIE_DB, VALIDATION_EVERY, VISIBLE_ERROR, WINDOW, Validation, split_validation
-from mipmap_plugin.adaptation.viewpoints import Viewpoints
-from mipmap_plugin.adaptation.views import choose_views
+from mipmap_plugin.adaptation.curve import INVISIBLE_ERROR
+from mipmap_plugin.adaptation.optimization.validation import TIE_DB, VISIBLE_ERROR, Validation
+from mipmap_plugin.adaptation.views.for_validation import VALIDATION_EVERY, WINDOW, split_validation
+from mipmap_plugin.adaptation.views.policy import choose_views
+from mipmap_plugin.adaptation.views.viewpoints import Viewpoints
 from mipmap_plugin.models.base import Traits
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes.orbits import Orbit

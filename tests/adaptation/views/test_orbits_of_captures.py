@@ -7,7 +7,7 @@ import tiny
 import torch
 
 from mipmap_plugin import wrap_model
-from mipmap_plugin.adaptation.viewpoints import orbit_of
+from mipmap_plugin.adaptation.views.viewpoints import orbit_of
 from mipmap_plugin.scenes.orbits import MIDDLE, NEARER, SHARP_FOCAL, SHARP_PX, Orbit, frame, sharp_size
 
 COUNT = 400

@@ -8,8 +8,8 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation import pixel_size as module
-from mipmap_plugin.adaptation.pixel_size import LEAST_VIEWS, MOST_VIEWS, SEEN, enough_views, mean_pixel_size, pixel_size, views_for
+from mipmap_plugin.adaptation.views import pixel_size as module
+from mipmap_plugin.adaptation.views.pixel_size import LEAST_VIEWS, MOST_VIEWS, SEEN, enough_views, mean_pixel_size, pixel_size, views_for
 from mipmap_plugin.backends.cpu import finest_pixels
 from mipmap_plugin.camera import Camera
 

@@ -8,7 +8,7 @@ import tiny
 import torch
 
 from mipmap_plugin import wrap_model
-from mipmap_plugin.adaptation.shown import seeing, showing
+from mipmap_plugin.adaptation.views.shown import seeing, showing
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.levels.distance.ladder import scene_of

@@ -14,9 +14,9 @@ from lone_capture import capture
 from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation import session
 from mipmap_plugin.adaptation.optimization.amount import DRAWS_A_SECOND, FOR_LOOKS, looks_in_budget
-from mipmap_plugin.adaptation.optimization.validation import split_validation
-from mipmap_plugin.adaptation.viewpoints import FOG, LEAST_LOOKS, TRIED, ClearViews, Viewpoints
-from mipmap_plugin.adaptation.views import choose_views
+from mipmap_plugin.adaptation.views.for_validation import split_validation
+from mipmap_plugin.adaptation.views.policy import choose_views
+from mipmap_plugin.adaptation.views.viewpoints import FOG, LEAST_LOOKS, TRIED, ClearViews, Viewpoints
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.evaluation.measure import adapt_alone
@@ -184,7 +184,7 @@ def test_views_beside_the_middle_are_adapted_to_and_no_others(monkeypatch):
 @pytest.mark.filterwarnings("ignore:no ")
 def test_views_that_are_adapted_to_are_finer_but_not_those_that_stand_for_the_training(monkeypatch):
     """From those follow the distances of a ladder."""
-    monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 200)  # a finer view of fewer shows little but a splat or two
+    monkeypatch.setattr("mipmap_plugin.adaptation.views.policy.ORBIT_PIXELS", 200)  # a finer view of fewer shows little but a splat or two
     lone = wrap_model(VanillaModel.from_gaussians(capture().to(dtype=torch.float32)))
     details = [{round(view.fx / 10) for view in views} for views in (lone.views(), lone.adapt(1 / 4, recipe="instant", extra_views=20).adapted_to)]
     assert [len(each) for each in details] == [2, 4]  # from near and from far

@@ -12,11 +12,11 @@ import tiny
 import torch
 
 from mipmap_plugin import cli, register_viewer, wrap_model
-from mipmap_plugin.adaptation.in_viewers import worse_viewers
 from mipmap_plugin.adaptation.optimization.run import Task
 from mipmap_plugin.adaptation.optimization.validation import VISIBLE_ERROR, Choice, Validation
-from mipmap_plugin.adaptation.start.candidates import StartSearch
-from mipmap_plugin.adaptation.target.portable import MERGE_FACTOR, MERGING_COSTS, extreme_targets, median_target
+from mipmap_plugin.adaptation.portable import MERGE_FACTOR, MERGING_COSTS, extreme_targets, median_target
+from mipmap_plugin.adaptation.start.search import StartSearch
+from mipmap_plugin.adaptation.worse import worse_viewers
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.reference import ReferenceBackend

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import compress
 from pathlib import Path
-from statistics import fmean, median
+from statistics import fmean
 
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.optimization.validation import HARM_DB
 from mipmap_plugin.adaptation.parallel import in_batches
-from mipmap_plugin.adaptation.pixel_size import seen_depth
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera, evenly
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError, some_of
 from mipmap_plugin.formats.splat_transform import is_spz
 from mipmap_plugin.limits import check_image
@@ -28,6 +27,7 @@ from mipmap_plugin.render_settings import MIN_ALPHA
 from mipmap_plugin.scenes import unread_cameras
 from mipmap_plugin.scenes.orbits import FRAMED, Orbit
 from mipmap_plugin.scenes.photographed import quantile
+from mipmap_plugin.splatting.packing import in_two_steps, packed
 
 # Views that are looked at to see whether they show anything; and the mean fraction of their splats in front of the near plane that is worth a word.
 # Floaters lie close to cameras, but captures in usual units have no splats there; made ten times smaller they have 2 %, twenty times smaller half.
@@ -64,14 +64,11 @@ OF_SPZ = "; an .spz is meant to have y up: if this one has, say so (--up y)"
 # Lenses whose focal lengths (px) have a larger ratio need different files, as scales of that ratio do. A ratio of 5 costs a capture 10 of 12 dB.
 UNLIKE = 3.0
 
-# A lens is called longer from this many times the shortest focal length on: what it sees is as one scale of a ladder and the next.
-LONGER = 2.0
-
 # What to do about lenses that no single file fits.
 EACH_LENS = "adapt with the cameras of each lens on their own"
 
-# Views count as close-ups if the nearest tenth of their splats lies before this part of its depth in others, as a level is to the next coarser.
-NEAREST, CLOSE = 0.1, 0.5
+# Views and splats by which it is measured how far a viewer that rounds positions displaces splats, and the fraction of displaced ones worth a word.
+ROUNDED_IN, ROUNDED, DISPLACED = 4, 1 << 14, 0.5
 
 # What is said where most cameras see nothing.
 MISFIT = "; so many may be of another scene, or in other coordinates: give those of this one, unless it was cut down"
@@ -156,44 +153,30 @@ def refuse_large(views: Sequence[Camera], model: SplatModel, scale: float) -> No
 
 def too_unlike(views: Sequence[Camera]) -> str:
     """That lenses differ so much that no file fits all of them, in a sentence; "" if they do not."""
-    shortest, longest = (pick(map(_focal, views)) for pick in (min, max))
+    shortest, longest = (pick(map(focal_length, views)) for pick in (min, max))
     if longest <= UNLIKE * shortest:
         return ""
     where = f"focal lengths of the cameras are {shortest:.0f} to {longest:.0f} px, and what looks right through one does not through another"
     return f"{where}; {EACH_LENS}"
 
 
-def worse_views(
-    views: Sequence[Camera], before: Sequence[float], after: Sequence[float], scale: float, means: Tensor, *, orbit: bool = False
-) -> list[str]:
-    """That the file for `scale` shows some views worse than the base does, while it gains by their mean, in a sentence; none where it loses by that.
-
-    `before`, `after`: dB of each view as far as differences are visible. `means` [N, 3]: of the base's splats. `orbit`: the views were generated,
-    some of them finer, and have no lens.
-    """
-    worse = [then > now + HARM_DB for then, now in zip(before, after, strict=True)]
-    if not any(worse) or sum(after) < sum(before):
-        return []
-    then, now = max(compress(zip(before, after, strict=True), worse), key=lambda pair: pair[0] - pair[1])
-    where = f"in {some_of(sum(worse), len(views), 'view')} that it was chosen by, the file for x{scale:g} looks worse than the base"
-    told = f"{where}, by up to {then - now:.1f} dB as far as differences can be seen ({then:.1f} -> {now:.1f}), though it gains by their mean"
-    shortest, longer = min(map(_focal, views)), min(map(_focal, compress(views, worse)))
-    if longer >= LONGER * shortest and not orbit:
-        told += f"; they are seen through longer lenses, of {longer:.0f} px and more, where the shortest has {shortest:.0f} px: {EACH_LENS}"
-    elif _are_close_ups(views, worse, means) and not orbit:
-        told += "; they are close-ups, and what looks right from afar does not from there: adapt with the cameras of close-ups on their own"
-    return [told]
+def too_far_out(model: SplatModel, views: Sequence[Camera], targets: Mapping[str, Effects]) -> str:
+    """That a viewer which keeps positions in 16 bits displaces most splats by more than their size, or loses them, in a sentence; "" if none does."""
+    for viewer, effects in targets.items():
+        positions = effects.settings.packing and in_two_steps(effects.settings.packing)[1]
+        if not positions:
+            continue
+        splats = model.gaussians(views[0]).detach()
+        splats = splats[:: max(1, len(splats) // ROUNDED)]
+        moved = [(packed(splats, view, positions).means - splats.means).abs().amax(1) for view in evenly(views, ROUNDED_IN)]
+        share = float((torch.stack(moved) > splats.scales.abs().amax(1)).double().mean())
+        if share > DISPLACED:
+            where = f"{viewer} keeps positions in 16 bits, by which {share:.0%} of the splats are off by more than their size, or lost"
+            return f"{where}; move the scene to the world's origin, with its cameras, or give another viewer"
+    return ""
 
 
-def _are_close_ups(views: Sequence[Camera], some: Sequence[bool], means: Tensor) -> bool:
-    """Whether `some` of the views [V] see the nearest of the `means` [N, 3] from much nearer than the others (`CLOSE`)."""
-    points = means[:: 1 + len(means) // SAMPLES[1]]
-    depths = [seen_depth(view, points, 0.0, NEAREST) for view in views]
-    others = [depth for depth, close in zip(depths, some, strict=True) if not close]
-    return max(compress(depths, some)) < CLOSE * median(others)
-
-
-def _focal(view: Camera) -> float:
+def focal_length(view: Camera) -> float:
     """The focal length of both axes, px, of the lens itself: a view of a band lies at a zoom of its own."""
     return math.sqrt(view.fx * view.fy) * view.base_zoom / view.zoom
 

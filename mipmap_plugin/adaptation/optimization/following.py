@@ -7,7 +7,8 @@ from typing import Any, cast
 
 from torch import Tensor
 
-from mipmap_plugin.adaptation.pixel_size import target_pixel
+from mipmap_plugin.adaptation.views.moments import follows
+from mipmap_plugin.adaptation.views.pixel_size import target_pixel
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.models.base import SplatModel
 
@@ -51,11 +52,6 @@ class Following:
     def evaluation(self) -> float:
         """Seconds of one evaluation of all splats at a moment; 0 before there was one."""
         return self._model.spent[1] if self._model is not None else 0.0
-
-
-def follows(base: SplatModel) -> bool:
-    """Whether a moving model keeps the results of its field; one of a third party need not."""
-    return base.traits.moves and hasattr(base, "follow")
 
 
 def keep_rows(model: SplatModel, rows: Tensor) -> None:

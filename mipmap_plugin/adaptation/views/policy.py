@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 
-from mipmap_plugin.adaptation.viewpoints import Viewpoints
+from mipmap_plugin.adaptation.views.viewpoints import Viewpoints
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError, plural
@@ -64,18 +63,3 @@ def over_band(views: Sequence[Camera], config: AdaptConfig) -> list[Camera]:
     if low == high == 1:
         return list(views)
     return [view.zoomed(low * (high / low) ** ((number + 0.5) * GOLDEN % 1)) for number, view in enumerate(views)]
-
-
-def with_times(views: Sequence[Camera], seed: int) -> tuple[list[Camera], str]:
-    """Give each view of a moving scene a time; return the views and a description of their times.
-
-    Views without a time get times evenly spread over 0..1, both ends included, in a random order, so that the time does not
-    follow the path of the cameras.
-    """
-    timeless = [number for number, view in enumerate(views) if view.time is None]
-    if not timeless:
-        return list(views), "at their own times"
-    order = torch.randperm(len(timeless), generator=torch.Generator().manual_seed(seed)).tolist()
-    times = {number: position / max(1, len(timeless) - 1) for number, position in zip(timeless, order, strict=True)}
-    timed = [replace(view, time=times.get(number, view.time)) for number, view in enumerate(views)]
-    return timed, f"{len(timeless)} of them without a time of their own, spread over 0..1"

@@ -6,7 +6,7 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.schedule import Rounds
+from mipmap_plugin.adaptation.views.schedule import Rounds
 
 
 def placed(x: float, y: float):

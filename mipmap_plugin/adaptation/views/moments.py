@@ -10,8 +10,6 @@ from itertools import chain, zip_longest
 
 import torch
 
-from mipmap_plugin.adaptation.following import follows
-from mipmap_plugin.adaptation.views import with_times
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.models.base import SplatModel
 
@@ -20,6 +18,21 @@ CHOOSING = 8
 
 # A time that more than this fraction of the views have is always one of the moments: the live view adapts a third of them to what it shows.
 MANY = 1 / 4
+
+
+def with_times(views: Sequence[Camera], seed: int) -> tuple[list[Camera], str]:
+    """Give each view of a moving scene a time; return the views and a description of their times.
+
+    Views without a time get times evenly spread over 0..1, both ends included, in a random order, so that the time does not
+    follow the path of the cameras.
+    """
+    timeless = [number for number, view in enumerate(views) if view.time is None]
+    if not timeless:
+        return list(views), "at their own times"
+    order = torch.randperm(len(timeless), generator=torch.Generator().manual_seed(seed)).tolist()
+    times = {number: position / max(1, len(timeless) - 1) for number, position in zip(timeless, order, strict=True)}
+    timed = [replace(view, time=times.get(number, view.time)) for number, view in enumerate(views)]
+    return timed, f"{len(timeless)} of them without a time of their own, spread over 0..1"
 
 
 def at_moments(views: Sequence[Camera], most: int | None) -> list[Camera]:
@@ -45,6 +58,11 @@ def at_their_moments(views: Sequence[Camera], validation: Sequence[Camera], most
     before, after = (len({view.time for view in some}) for some in ([*views, *validation[::2]], used))
     paired = [view for view in chain(*zip_longest(steering, choosing)) if view is not None]
     return used[: len(views)], paired, times if after == before else f"{times}, each at the nearest of {after} moments"
+
+
+def follows(base: SplatModel) -> bool:
+    """Whether a moving model keeps the results of its field; one of a third party need not."""
+    return base.traits.moves and hasattr(base, "follow")
 
 
 @torch.no_grad()
