@@ -26,7 +26,7 @@ from mipmap_plugin.adaptation.optimization.validation import COMPARED_WITH_BASE,
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, color_limits, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, option_note, simulated, versions
 from mipmap_plugin.adaptation.request import AdaptationRequest, Observer, ends_run
-from mipmap_plugin.adaptation.shown import refuse_blind, remarks, showing, too_unlike, worse_views
+from mipmap_plugin.adaptation.shown import hints, refuse_blind, remarks, showing, worse_views
 from mipmap_plugin.adaptation.start.bands import used_degree, with_more_bands
 from mipmap_plugin.adaptation.start.candidates import best_start
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
@@ -108,13 +108,13 @@ class Session:
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
         """Adapt the base, or continue the run that `resume` holds, and return the best state."""
-        near, wanted = self.drawn.base.near_plane, self.wanted or self.scale
-        refuse_blind(self.base_views, self.base, near, self.truth, wanted)
+        near, wanted, views = self.drawn.base.near_plane, self.wanted or self.scale, self.base_views
+        refuse_blind(views, self.base, near, self.truth, wanted)
         if self._base_is_right:
             copy, reason = self.drawn.copied(self.base), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.drawn.effects, self.drawn.targets)
-        found = [too_unlike(self.base_views), too_far_out(self.base, self.base_views, self.drawn.targets), unused_upsampler(self.config, wanted)]
-        for remark in filter(None, [*remarks(self.base_views, self.base, near, orbit=self._orbits), *found, option_note(self.base, wanted)]):
+        found = [*hints(views, self.base, near), too_far_out(self.base, views, self.drawn.targets), unused_upsampler(self.config, wanted)]
+        for remark in filter(None, [*remarks(views, self.base, near, orbit=self._orbits), *found, option_note(self.base, wanted)]):
             warn(remark)
         began = now(self.device) - self.seconds["total"]
         self._compile(self.base)
