@@ -94,7 +94,8 @@ class FrozenBase:
         if viewer is not None:
             if screen_filter is not None:
                 raise SettingsError(f"viewer {viewer} has a screen filter of its own; leave the screen filter {screen_filter} out")
-            return find_viewer(viewer).effects(own)
+            drawn = find_viewer(viewer).effects(own)
+            return drawn if own.near_plane >= self.model.trained.near_plane else replace(drawn, near_plane=min(drawn.near_plane, own.near_plane))
         if screen_filter is None:
             return own
         scaled = replace(own, eps2d=trained.eps2d * scale**2)
@@ -273,7 +274,7 @@ class FrozenBase:
     def viewpoints(self) -> Viewpoints:
         """Where views without cameras are. Raises SettingsError without splats."""
         clear = ClearViews(self.model, partial(choose_backend, self._backend, self._needs), self.effects())
-        return Viewpoints(orbit_of(self.model, self.trained.up, lone=not self.cameras), clear)
+        return Viewpoints(orbit_of(self.model, self.trained, lone=not self.cameras), clear)
 
     def refuse_undrawn(self, views: Sequence[Camera] | None = None, scale: float = 1.0) -> None:
         """Raise SettingsError if none of the views, by default the base's own, shows anything of it at `scale` (`refuse_blind`)."""

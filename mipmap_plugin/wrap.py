@@ -17,6 +17,7 @@ from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrup
 from mipmap_plugin.adaptation.target.other_world import LOOK, doubt_about
 from mipmap_plugin.adaptation.views.cameras_of_base import own_cameras, where
 from mipmap_plugin.adaptation.views.placing import placed
+from mipmap_plugin.adaptation.views.viewpoints import near_plane_for
 from mipmap_plugin.backends import BACKENDS, device_for
 from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.camera import Camera, digest_of, of_base_scale
@@ -118,6 +119,8 @@ def wrap_unchecked(
     if up is not None and given:
         warn(f"up {up}: there are cameras, whose views are taken unless an orbit is asked for (views 'orbit'); only then it is of use")
     there = placed(model, found) if isinstance(found, Scene) else None
+    if not given:
+        trained = replace(trained, near_plane=near_plane_for(model, trained.near_plane))
     wrapped = Wrapped(model, there.cameras if there else given, backend, trained, threads)
     wrapped.loading_s, wrapped.asked, wrapped.cameras_from = loading_s, asked_for(model.folder, given, color, screen_filter, up), read_from
     return wrapped, there

@@ -37,7 +37,7 @@ from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.views.for_validation import WINDOW, split_validation
 from mipmap_plugin.adaptation.views.moments import at_their_moments, evaluate_moments
 from mipmap_plugin.adaptation.views.policy import choose_views, over_band
-from mipmap_plugin.adaptation.views.shown import refuse_blind, remarks, showing, too_far_out, too_unlike
+from mipmap_plugin.adaptation.views.shown import hints, refuse_blind, remarks, showing, too_far_out
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.adaptation.worse import better_as_trained, worse_viewers, worse_views
 from mipmap_plugin.backends.base import Calls
@@ -107,13 +107,13 @@ class Session:
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
         """Adapt the base, or continue the run that `resume` holds, and return the best state."""
-        near, final = self.drawn.base.near_plane, self.request.zoom_in or self.scale
-        refuse_blind(self.base_views, self.base, near, self.truth, final)
+        near, final, views = self.drawn.base.near_plane, self.request.zoom_in or self.scale, self.base_views
+        refuse_blind(views, self.base, near, self.truth, final)
         if self._base_is_right:
             copy, reason = self.drawn.copied(self.base), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.drawn.effects, self.drawn.targets)
-        found = [too_unlike(self.base_views), too_far_out(self.base, self.base_views, self.drawn.targets), unused_upsampler(self.config, final)]
-        for remark in filter(None, [*remarks(self.base_views, self.base, near, orbit=self._orbits), *found, option_note(self.base, final)]):
+        found = [*hints(views, self.base, near), too_far_out(self.base, views, self.drawn.targets), unused_upsampler(self.config, final)]
+        for remark in filter(None, [*remarks(views, self.base, near, orbit=self._orbits), *found, option_note(self.base, final)]):
             warn(remark)
         began = now(self.device) - self.seconds["total"]
         self._compile(self.base)

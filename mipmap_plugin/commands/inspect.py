@@ -79,7 +79,7 @@ def _differences(wrapped: Wrapped) -> str:
 
 def _facts(checkpoint: Path, wrapped: Wrapped, given: Path | None, *, whole: bool) -> dict[str, Any]:
     """What is known of a loaded model without a picture, by name. `given`: where its cameras lie; `whole`: with the effects that are off."""
-    from mipmap_plugin.adaptation.views.shown import remarks, too_unlike
+    from mipmap_plugin.adaptation.views.shown import hints, remarks
     from mipmap_plugin.effects import explain
     from mipmap_plugin.models.base import effects_of
     from mipmap_plugin.models.health import examine, holds_splats
@@ -92,12 +92,13 @@ def _facts(checkpoint: Path, wrapped: Wrapped, given: Path | None, *, whole: boo
         health = examine(model if holds_splats(model) else VanillaModel.from_gaussians(by_axes(gaussians), model.trained))
         effects = explain(wrapped.effects(), gaussians, effects_of(model))
         off = sum(not effect.on for effect in effects)
-        lost = remarks(wrapped.views(), model, wrapped.effects().near_plane, orbit=not wrapped.cameras)
+        near = wrapped.effects().near_plane
+        lost = remarks(wrapped.views(), model, near, orbit=not wrapped.cameras)
         try:
             wrapped.refuse_undrawn()
         except SettingsError as error:  # which adapting would raise
             lost = [*dict.fromkeys([str(error), *lost])]
-        told = [*health.sentences(), *lost, *filter(None, [too_unlike(wrapped.views())])]
+        told = [*health.sentences(), *lost, *hints(wrapped.views(), model, near)]
     return {
         "verdict": _verdict(wrapped, _advice(wrapped, checkpoint, given), told, bool(lost) or health.spoilt(), health.mostly_unseen()),
         "splats": len(gaussians),

@@ -29,6 +29,9 @@ BRIGHTEST = 16
 # Of more numbered columns than this, only the first and the last are named.
 LISTED = 4
 
+# And so many names of columns are told at most.
+TOLD = 8
+
 # Rows that are transposed together: 1 to 2 MB of a file, which stay in the cache while columns are copied.
 CHUNK = 8192
 
@@ -120,12 +123,13 @@ def notes_on(extras: Mapping[str, np.ndarray]) -> list[str]:
 
 
 def in_short(names: Iterable[str]) -> str:
-    """Names of columns in words, of many that are numbered the first and the last: "segment, semantic_0 to semantic_511"."""
+    """Names of columns in words, of many that are numbered the first and the last: "segment, semantic_0 to semantic_511"; of others the first."""
     words = []
     for prefix, group in groupby(names, lambda name: re.sub(r"\d+$", "", name)):
         some = list(group)
         words += [f"{some[0]} to {some[-1]}"] if prefix.endswith("_") and len(some) > LISTED else some
-    return ", ".join(words)
+    told = ", ".join(words[:TOLD])
+    return f"{told} and {len(words) - TOLD} more" if len(words) > TOLD else told
 
 
 def notes_on_types(columns: Mapping[str, np.ndarray]) -> list[str]:

@@ -70,7 +70,8 @@ def detect_as(path: str | Path, families: tuple[str, ...], *, iteration: int | N
 
 def _recognize(path: Path) -> tuple[Checkpoint, Match]:
     if not path.exists():
-        raise CheckpointError(f"{path} does not exist; give a PLY file or a model folder")
+        leads = f"is a link to {path.readlink()}, which " if path.is_symlink() else ""  # as in a cache, whose download was removed
+        raise CheckpointError(f"{path} {leads}does not exist; give a PLY file or a model folder")
     files = Files(path)
     claims, notes = _claims(files)
     family, match = _most_certain(files, claims, notes)

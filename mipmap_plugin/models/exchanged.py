@@ -9,7 +9,7 @@ import torch
 
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.ply import read_header
-from mipmap_plugin.formats.splat_transform import EXCHANGE, as_ply
+from mipmap_plugin.formats.splat_transform import EXCHANGE, TOOL, as_ply
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.formats.zipped import unpacked
 from mipmap_plugin.models.columns import OPACITY_MARGIN
@@ -26,7 +26,7 @@ def load_exchanged(path: str | Path, *, iteration: int | None = None) -> Vanilla
     file = detect_as(path, ("exchange",), iteration=iteration).path
     files = Files(file)
     kind = "compressed" if files.compressed else files.kind
-    with as_ply(file, kind) as ply:
+    with as_ply(file, kind) as ply, retold(lambda words: str(words).replace(str(ply), f"{file}, as {TOOL} reads it")):
         model = _read(ply, file, "{file}: its splats are of {title}, not read from this format; give its own file")
     largest = torch.tensor(OPACITY_MARGIN).logit().abs().item()
     model.parameters()["opacities"].clamp_(-largest, largest)  # 8-bit opacities may be 0 or 1, whose logits are infinite

@@ -19,6 +19,7 @@ from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_spz, refu
 from mipmap_plugin.formats.spz import fraction_for
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.columns import in_short
 from mipmap_plugin.models.health import COARSE_SHARE, COARSE_STEP, extent_of, rows_where
 from mipmap_plugin.models.places import CONVERTED, PARTS, REPORT, STATE, has_report
 
@@ -106,7 +107,7 @@ def without_place(path: Path, extras: Iterable[str], sh_degree: int) -> str:
     """What the file at `path` will not hold, in a sentence: columns that 3DGS does not define, high SH bands; "" if it holds everything."""
     if not (ending := written_ending(path)):
         return ""
-    names = ", ".join(extras)
+    names = in_short(extras)
     lost = [f"the extra columns {names} are dropped, since {ending} has no place for them; a .ply has"] if names else []
     without = "glTF has no place for" if ending == ".glb" else f"{TOOL} does not write"
     lost += [f"SH bands above degree {MOST_BANDS} are dropped, which {without}; a .ply has them"] if sh_degree > MOST_BANDS else []

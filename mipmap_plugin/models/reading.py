@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
-from mipmap_plugin.errors import CheckpointError, warn
+from mipmap_plugin.errors import CheckpointError, some_of, warn
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import recorded_filter, render_mode
@@ -22,6 +23,10 @@ from mipmap_plugin.models.vanilla import Model, Origin, VanillaModel
 
 # A fused file of Mip-Splatting has the columns of 3DGS; only its usual name tells it apart.
 FUSED = "its name says that a 3D filter is fused into it; if Mip-Splatting trained it, say so (--screen-filter mip)"
+
+# Of a file with more rows of zeros than this fraction a part is missing: a download, or a copy, has not ended. Drawn, such a row is a gray ball of
+# size 1 at the origin, and no training writes one, for the quaternion of a splat has a length.
+MOST_BLANK = 0.01
 
 
 def load_vanilla(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
@@ -53,7 +58,19 @@ def read_splats(checkpoint: Checkpoint, kind: type[Model], *networks: Path) -> M
         model.notes.append(f"the header says that the splats are to be drawn {trained.screen_filter} ({trained.eps2d:g} px²)")
     model.notes += notes_on(extras)
     model.notes += [FUSED] if "fused" in path.stem and taken_as_classic else []
-    return without_invalid(model)
+    return without_invalid(_without_blank(model, path))
+
+
+def _without_blank(model: Model, path: Path) -> Model:
+    """The model without rows of zeros, with a note. Raises CheckpointError if there are many (MOST_BLANK)."""
+    raw = [tensor.detach().flatten(1) if tensor.dim() > 1 else tensor.detach()[:, None] for tensor in model.parameters().values()]
+    blank = (model.parameters()["quats"].detach() == 0).all(1)
+    blank[blank.clone()] = torch.stack([(tensor[blank] == 0).all(1) for tensor in raw]).all(0)
+    count = int(blank.sum())
+    if count > MOST_BLANK * len(model):
+        missing = f"{some_of(count, len(model), 'row', 'hold')} nothing but zeros"
+        raise CheckpointError(f"{path} is not whole: {missing}, as where a download or a copy has not ended; download or copy it again")
+    return drop(model, blank, "they hold nothing but zeros", path) if count else model
 
 
 def without_invalid(model: Model) -> Model:

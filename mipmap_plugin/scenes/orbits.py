@@ -45,6 +45,9 @@ FINER, EVERY = 2.0, 5
 # half of TURN (radians) to all of it.
 BESIDE, TURN = (1, 2), math.radians(40)
 
+# So many splats, evenly chosen, tell whether a scene is small.
+SAMPLE = 1 << 16
+
 # Largest ratio of the extent along y to those along x and z at which y is assumed to be vertical.
 FLATTER = 0.8
 
@@ -80,31 +83,31 @@ class Orbit:
     focal: float = 0.0
 
     @classmethod
-    def around(cls, means: Tensor, sharp: Callable[[], float] = lambda: math.inf) -> Orbit:
+    def around(cls, means: Tensor, sharp: Callable[[], float] = lambda: math.inf, near: float = NEAR_PLANE) -> Orbit:
         """Around `means` [N, 3], from a distance that frames them as `frame` says, with the vertical of `guess_up`.
 
-        `sharp`: the size of sharp splats (`sharp_size`), of which a capture is seen from so near that they are about as large as pixels. Raises
-        SettingsError without splats.
+        `sharp`: the size of sharp splats (`sharp_size`), of which a capture is seen from so near that they are about as large as pixels. `near`:
+        the near plane, in world units. Raises SettingsError without splats.
         """
         means = _finite(means)
         center, radius, whole = frame(means)
-        distance = max(radius / math.sin(ORBIT_FOV / 2), radius + 2 * NEAR_PLANE)  # a small scene must not lie in front of the near plane
+        distance = max(radius / math.sin(ORBIT_FOV / 2), radius + 2 * near)  # a small scene must not lie in front of the near plane
         nearest = 0.0
         if not whole:
             from_here = sharp() / SHARP_PX * SHARP_FOCAL
-            outside = max(quantile((means - center).norm(dim=1), MIDDLE).item(), 2 * NEAR_PLANE)
+            outside = max(quantile((means - center).norm(dim=1), MIDDLE).item(), 2 * near)
             distance, nearest = (min(distance, max(far, outside)) for far in (from_here, NEARER * from_here))
         x, y, z = center.tolist()
         return cls((x, y, z), guess_up(means), distance, nearest=nearest)
 
-    def where_photographed(self, splats: Gaussians) -> Orbit:
+    def where_photographed(self, splats: Gaussians, near: float = NEAR_PLANE) -> Orbit:
         """The orbit from where the colors of the splats tell that a capture was photographed; the same if they do not tell, and around an object.
 
         What is compact, but was photographed from near or from within (`WITHIN`), is no object.
         """
         center = torch.tensor(self.center, dtype=torch.float64)
         away = (_finite(splats.means) - center).norm(dim=1)
-        outside, framing = max(quantile(away, MIDDLE).item(), 2 * NEAR_PLANE), quantile(away, FRAMED).item() / math.sin(ORBIT_FOV / 2)
+        outside, framing = max(quantile(away, MIDDLE).item(), 2 * near), quantile(away, FRAMED).item() / math.sin(ORBIT_FOV / 2)
         found = photographed(splats, center, outside, max(outside, framing), ORBIT_FOV / 2)
         if found is None or (not self.nearest and found.nearest > WITHIN * framing):
             return self
@@ -167,6 +170,13 @@ def frame(means: Tensor) -> tuple[Tensor, float, bool]:
     median, middle = means.median(dim=0).values, (quantile(means, WHOLE) + quantile(means, 1 - WHOLE)) / 2
     most, whole = (quantile((means - center).norm(dim=1), share).item() for center, share in ((median, FRAMED), (middle, WHOLE)))
     return (middle, whole, True) if whole <= TIGHT * most else (median, most, False)
+
+
+def radius_if_small(means: Tensor, near: float) -> float:
+    """What pictures of `means` [N, 3] show (`frame`), if a near plane at `near` keeps views from framing it, in world units; 0 if not."""
+    means = means[means.isfinite().all(dim=1)]
+    radius = frame(means[:: 1 + len(means) // SAMPLE])[1] if len(means) else 0.0
+    return radius if radius / math.sin(ORBIT_FOV / 2) < radius + 2 * near else 0.0
 
 
 def sharp_size(gaussians: Gaussians) -> float:

@@ -17,6 +17,7 @@ from mipmap_plugin.adaptation.worse import better_as_trained, worse_views
 from mipmap_plugin.errors import plural, warn
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.torch_file import load_torch
+from mipmap_plugin.models.columns import in_short
 from mipmap_plugin.models.loaders import unread
 from mipmap_plugin.process.versions import versions
 from mipmap_plugin.tiles.folder import START
@@ -72,7 +73,7 @@ def make_report(
     after = sum(read_header(file).vertex.count for file in files)
     model, config = scene.wrapped.model, scene.config
     steps = max((tile["step"] for tile in tiles), default=0)
-    lost = [f"the extra columns {', '.join(scene.extras)} are dropped, since tiles hold none"] if scene.extras else []
+    lost = [f"the extra columns {in_short(scene.extras)} are dropped, since tiles hold none"] if scene.extras else []
     lost += [sentence for sentence in [unread(scene.viewer, model, files[0])] if sentence]
     for note in [*judgment.notes, *lost]:
         warn(note)

@@ -15,7 +15,7 @@ import torch
 
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report
 from mipmap_plugin.adaptation.target.detail import unused_upsampler
-from mipmap_plugin.adaptation.views.shown import refuse_blind, remarks, too_far_out, too_unlike
+from mipmap_plugin.adaptation.views.shown import hints, refuse_blind, remarks, too_far_out
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.camera import Camera
@@ -117,7 +117,7 @@ def _examine_views(jobs: Sequence[Job]) -> None:
         model, views, near = scene.wrapped.model, scene.views.adapted, scene.base_effects.near_plane
         refuse_blind(views, model, near, partial(draw_base, scene), scene.scale)
         orbit = not scene.wrapped.cameras or scene.config.views == "orbit"
-        found = too_unlike(views), too_far_out(model, views, {str(scene.viewer): scene.target}), unused_upsampler(scene.config, scene.scale)
+        found = *hints(views, model, near), too_far_out(model, views, {str(scene.viewer): scene.target}), unused_upsampler(scene.config, scene.scale)
         for remark in filter(None, [*remarks(views, model, near, orbit=orbit), *found]):
             warn(remark)
 

@@ -104,7 +104,7 @@ class TiledScene:
     @cached_property
     def viewpoints(self) -> Viewpoints:
         """Where views without cameras are: around all splats. Each counts as clear, for nothing here draws the whole scene to look."""
-        orbit = orbit_of(self.wrapped.model, self.wrapped.trained.up, self.base.places[:, :3], lone=not self.wrapped.cameras)
+        orbit = orbit_of(self.wrapped.model, self.wrapped.trained, self.base.places[:, :3], lone=not self.wrapped.cameras)
         return Viewpoints(orbit, list)
 
     @cached_property

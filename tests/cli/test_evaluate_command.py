@@ -173,7 +173,8 @@ def test_a_lone_file_is_judged_by_photographs_with_the_cameras_that_are_given(ru
 def test_evaluate_asks_for_a_checkpoint(run, tmp_path):
     refused(run("evaluate", "--images", tmp_path, "--scale", "1/2"), "there is no checkpoint to evaluate; give a PLY or a model folder")
     (tmp_path / "itself").symlink_to("itself")
-    refused(run("evaluate", tmp_path / "itself", "--images", tmp_path, "--scale", "1/2"), "itself does not exist; give a PLY file or a model folder")
+    looped = run("evaluate", tmp_path / "itself", "--images", tmp_path, "--scale", "1/2")
+    refused(looped, "itself is a link to itself, which does not exist; give a PLY file or a model folder")
 
 
 def test_evaluate_refuses_what_cannot_be_judged(run, model_folder, tmp_path):

@@ -72,6 +72,16 @@ def test_what_is_wrong_with_what_the_tool_made_of_a_file_is_said_of_the_file(tmp
     assert sentence(tmp_path / "a.spz").startswith(f"{tmp_path / 'a.spz'}, as splat-transform reads it: ")
 
 
+def test_what_is_doubtful_in_what_the_tool_made_of_a_file_is_said_of_the_file(tmp_path, tool):
+    columns = read_ply(tool / "answer.ply").columns
+    columns["x"][0] = np.nan
+    write(tool / "answer.ply", columns)
+    (tmp_path / "a.spz").write_bytes(SPZ)
+    with pytest.warns(UserWarning) as caught:
+        load_model(tmp_path / "a.spz")
+    assert [str(each.message).split(":")[0] for each in caught] == [f"{tmp_path / 'a.spz'}, as splat-transform reads it"]
+
+
 def test_compressed_ply_is_recognized_by_its_columns(tmp_path, tool):
     write(tmp_path / "a.ply", {"packed_position": np.zeros(1, np.int32)})
     assert len(load_model(tmp_path / "a.ply")) == 60

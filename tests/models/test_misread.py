@@ -169,3 +169,31 @@ def test_a_live_canonical_cloud_is_taken_with_a_note():
     """The class of Deformable 3D Gaussians has the tensors of 3DGS, without `capture`; the network is another object."""
     assert any("Deformable" in note for note in adopt(live_model(splats())).notes)
     assert not any("Deformable" in note for note in adopt(live_model(splats(), capture=tuple)).notes)
+
+
+def rows_of_zeros(path, count):
+    """A PLY of 400 splats, of which the last `count` are not there yet, as where a download has set the size of its file first."""
+    columns = splat_columns(400)
+    for column in columns.values():
+        column[400 - count :] = 0
+    return write(path, columns)
+
+
+def test_a_download_that_has_not_ended_is_refused_where_its_file_has_its_size_already(tmp_path):
+    path = rows_of_zeros(tmp_path / "a.ply", 5)
+    with pytest.raises(CheckpointError) as caught:
+        load_model(path)
+    told = "is not whole: 5 of 400 rows hold nothing but zeros, as where a download or a copy has not ended; download or copy it again"
+    assert str(caught.value) == f"{path} {told}"
+
+
+def test_a_few_rows_of_zeros_are_left_out(tmp_path):
+    with pytest.warns(UserWarning, match="4 of 400 splats were dropped: they hold nothing but zeros"):
+        assert len(load_model(rows_of_zeros(tmp_path / "a.ply", 4))) == 396
+
+
+def test_a_splat_without_a_quaternion_is_kept(tmp_path):
+    columns = splat_columns(4)
+    for i in range(4):
+        columns[f"rot_{i}"][0] = 0
+    assert len(load_model(write(tmp_path / "a.ply", columns))) == 4

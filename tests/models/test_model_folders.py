@@ -78,6 +78,12 @@ def test_folders_without_an_answer(tmp_path):
         detect(tmp_path / "none")
 
 
+def test_of_a_link_is_told_where_it_leads(tmp_path):
+    (tmp_path / "a.ply").symlink_to("blobs/4fa1")
+    with pytest.raises(CheckpointError, match=r"a\.ply is a link to blobs.4fa1, which does not exist; give"):
+        detect(tmp_path / "a.ply")
+
+
 def test_folder_with_one_ply_and_with_several(tmp_path):
     only = write_splats(tmp_path / "fused.ply")
     assert detect(tmp_path).path == only

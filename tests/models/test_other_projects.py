@@ -1,11 +1,14 @@
 """What projects derived from 3DGS save: read where it is the same, and refused by name where it has the columns of 3DGS and another meaning."""
 
+from pathlib import Path
+
 import pytest
 import torch
 from ply_files import CFG_ARGS, splat_columns, write, write_model_folder, write_splats
 
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.models import detect, load_model
+from mipmap_plugin.models.outputs import without_place
 
 COLUMNS = splat_columns(4, bands=3)
 ONE = COLUMNS["x"]
@@ -41,6 +44,14 @@ def test_many_numbered_columns_are_named_in_short(tmp_path):
     extra = dict.fromkeys(["label", *(f"semantic_{i}" for i in range(512)), "k_0", "k_1"], ONE)
     (note,) = load_model(write(tmp_path / "a.ply", {**COLUMNS, **extra})).notes
     assert note == "extra columns are carried along: label, semantic_0 to semantic_511, k_0, k_1"
+
+
+def test_of_many_other_columns_the_first_are_named(tmp_path):
+    extra = [f"{word}_{of}" for word in ("mean", "var", "min", "max") for of in ("color", "depth", "normal")]
+    model = load_model(write(tmp_path / "a.ply", {**COLUMNS, **dict.fromkeys(extra, ONE)}))
+    told = f"{', '.join(extra[:8])} and 4 more"
+    assert model.notes == [f"extra columns are carried along: {told}"]
+    assert without_place(Path("a.glb"), model.extras, 0) == f"the extra columns {told} are dropped, since .glb has no place for them; a .ply has"
 
 
 def test_e_d3dgs_is_not_taken_for_4dgaussians(tmp_path):

@@ -21,7 +21,7 @@ from mipmap_plugin.formats.splat_transform import is_spz
 from mipmap_plugin.limits import check_image
 from mipmap_plugin.models.base import SplatModel, means_at
 from mipmap_plugin.models.contract import row_opacities
-from mipmap_plugin.models.health import units
+from mipmap_plugin.models.health import extent_of, units
 from mipmap_plugin.progress import announced
 from mipmap_plugin.render_settings import MIN_ALPHA
 from mipmap_plugin.scenes import unread_cameras
@@ -218,6 +218,20 @@ def too_small(views: Sequence[Camera], model: SplatModel, near: float, least: fl
     elif len(splats) <= most**2:
         return ""
     return f"the scene is {units(width, 2)} units wide, and no view shows it larger than {units(most, 2)} px: {wrong}"
+
+
+def in_small_units(model: SplatModel, near: float) -> str:
+    """That a scene is so small that it is seen with a nearer near plane, at `near`, than in its training, in a sentence; "" if it is not."""
+    usual = model.trained.near_plane
+    if near >= usual:
+        return ""
+    wide = f"the scene is {units(extent_of(model.parameters()['means'].detach()), 2)} units wide, and is seen here from nearer"
+    return f"{wide} than {usual:g} units, where renderers of 3DGS draw nothing; if it is for one of these, {SCALE_UP}"
+
+
+def hints(views: Sequence[Camera], model: SplatModel, near: float) -> list[str]:
+    """What is to be known of views and of units, in sentences, which makes no scene doubtful. `near`: the near plane, in world units."""
+    return [sentence for sentence in (too_unlike(views), in_small_units(model, near)) if sentence]
 
 
 def far_apart(means: Tensor) -> str:

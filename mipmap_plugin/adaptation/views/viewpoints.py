@@ -18,9 +18,9 @@ from mipmap_plugin.camera import ONE_PIXEL, Camera, evenly
 from mipmap_plugin.effects import Effects, colorless
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.adapted_scale import adapted_orbit
-from mipmap_plugin.models.base import SplatModel, means_at
+from mipmap_plugin.models.base import SplatModel, TrainedScale, means_at
 from mipmap_plugin.process.threads import side_by_side
-from mipmap_plugin.scenes.orbits import EVERY, Orbit, sharp_size
+from mipmap_plugin.scenes.orbits import EVERY, Orbit, radius_if_small, sharp_size
 from mipmap_plugin.scenes.photographed import sizes
 from mipmap_plugin.splatting.harmonics import C0
 
@@ -47,6 +47,10 @@ LEAST_LOOKS = 16
 # Which of five pairs of views is finer. Of validation views the first of a pair steers and the second chooses: so as many of both are finer, one of
 # eight views each, two of sixteen, and none of four.
 FINER_PAIR = 2
+
+# The near plane of a small scene, as a fraction of the radius that pictures show: that of 3DGS in a scene that is 4 units wide. So many standard
+# deviations of a splat are seen; where they are more than the radius, it is a few splats that are seen, and no scene.
+NEAR_SHARE, REACH = 0.1, 3.0
 
 INSTEAD = "give the scene's cameras (--cameras), or adapt for what you look at (mipmap-plugin view)"
 UNCLEAR = f"no generated view that was looked at sees this capture clearly, only through fog or walls, or nothing: any are taken; {INSTEAD}"
@@ -140,21 +144,34 @@ class ClearViews:
         return bool(all_of_it > 0 and fog <= all_of_it / 2)
 
 
-def orbit_of(model: SplatModel, up: tuple[float, float, float] | None, means: Tensor | None = None, *, lone: bool = False) -> Orbit:
+def orbit_of(model: SplatModel, trained: TrainedScale, means: Tensor | None = None, *, lone: bool = False) -> Orbit:
     """What an orbit around a model goes around. That of an adapted file is its base's, so that both are seen from the same places.
 
-    `up`: the vertical, as the user or the base's files say (`wrap.Wrapped.trained`); None: they do not. `means` [N, 3]: of all splats,
+    `trained`: with the vertical, as the user or the base's files say, and the near plane (`wrap.Wrapped.trained`). `means` [N, 3]: of all splats,
     where the model has but some of its file. `lone`: it came without cameras, so that its colors are asked where it was photographed.
     """
     recorded = adapted_orbit(model.source)
     if recorded is None:
         same, splats = model.traits.same_for_all_views, cache(partial(model.gaussians, ONE_PIXEL))
-        orbit = Orbit.around(everywhere(model) if means is None else means, sharp=lambda: sharp_size(splats()) if same else math.inf)
+        near, places = trained.near_plane, everywhere(model) if means is None else means
+        orbit = Orbit.around(places, lambda: sharp_size(splats()) if same else math.inf, near)
         if lone and same:
-            orbit = orbit.where_photographed(splats())
+            orbit = orbit.where_photographed(splats(), near)
     else:
         orbit = Orbit(**recorded)
-    return orbit if up is None else replace(orbit, up=up, said=True)
+    return orbit if trained.up is None else replace(orbit, up=trained.up, said=True)
+
+
+def near_plane_for(model: SplatModel, usual: float) -> float:
+    """The near plane, in world units, of a model that came without cameras: as `usual`, or nearer for a small scene, which views are to frame.
+
+    Objects of less than 0.6 units, as phones scan them in meters, were seen from too far away, and adapted to smaller pictures than was asked for.
+    """
+    if model.traits.moves or not model.traits.same_for_all_views:
+        return usual
+    radius = radius_if_small(model.parameters()["means"].detach(), usual)
+    few = radius > 0 and REACH * float(sizes(model.gaussians(ONE_PIXEL).detach()).nanmedian()) > radius
+    return NEAR_SHARE * radius if radius and not few else usual
 
 
 def everywhere(model: SplatModel) -> Tensor:

@@ -14,6 +14,8 @@ from mipmap_plugin.adaptation.views.shown import far_apart, remarks
 from mipmap_plugin.adaptation.worse import worse_views
 from mipmap_plugin.camera import Camera, viewmat_of
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.scenes.orbits import Orbit
 from mipmap_plugin.wrap import wrap_model
 
 MEANS = torch.zeros(1, 3)  # of a splat in the middle of all views
@@ -111,17 +113,42 @@ def test_a_scene_nearer_than_the_near_plane_is_refused_with_what_to_do():
         wrap_model(shrunk(0.01), cameras=moved_away(0.01)).adapt(0.5, steps=0, views="given")
 
 
-def test_a_scene_in_small_units_is_told_of_where_the_near_plane_keeps_an_orbit_away_from_it(monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.adaptation.views.policy.ORBIT_PIXELS", 800)
+def test_a_scene_in_small_units_is_told_of_where_the_near_plane_keeps_views_away_from_it():
     base = wrap_model(shrunk(0.02))
+    views = Orbit.around(base.model.parameters()["means"]).views((800, 800), 4, torch.Generator().manual_seed(0))
     where = r"the scene is 0.0\d+ units wide, and no view shows it larger than \S+ px: renderers of 3DGS draw nothing nearer than 0.2 units; "
     where += "scale the scene up, with its cameras if it has any"  # here it has none
-    [remark] = remarks(base.views(), base.model, 0.2, orbit=True)
-    assert re.match(where, remark) and not remarks(base.views(), base.model, 0.2, orbit=False)
-    with pytest.raises(SettingsError, match=r"renderers of 3DGS draw nothing nearer than 0\.2 units"):
-        wrap_model(shrunk(1e-4)).adapt(0.5, recipe="instant")
+    [remark] = remarks(views, base.model, 0.2, orbit=True)
+    assert re.match(where, remark) and not remarks(views, base.model, 0.2, orbit=False)
     with pytest.raises(SettingsError, match="the cameras seem to be in other units"):
         wrap_model(tiny.model(), cameras=moved_away(100.0)).adapt(0.5, recipe="instant")
+
+
+@pytest.mark.parametrize("size", [0.1, 1e-4])
+def test_a_small_scene_is_adapted_as_a_large_one_and_told_of(size):
+    """As phones scan objects in meters: it was seen from too far away, and adapted to smaller pictures than was asked for, or refused."""
+    usual = wrap_model(shrunk(1.0)).adapt(1 / 4, recipe="instant", extra_views=4)
+    with pytest.warns(UserWarning, match=r"seen here from nearer than 0\.2 units, where renderers of 3DGS draw nothing; if .* scale the scene up"):
+        small = wrap_model(shrunk(size)).adapt(1 / 4, recipe="instant", extra_views=4)
+    shapes = [adapted.model.parameters()["scales"].detach() for adapted in (usual, small)]
+    assert len(small.model) == len(usual.model)
+    torch.testing.assert_close(shapes[1] - math.log(size), shapes[0], atol=0.05, rtol=0)
+
+
+def test_a_viewer_with_a_near_plane_draws_a_small_scene_in_views_that_frame_it():
+    """Else a file for it, or for several viewers, would be adapted to pictures of nothing."""
+    base = wrap_model(shrunk(0.02))
+    assert base.effects(viewer="classic").near_plane == base.effects().near_plane < 0.003
+    assert wrap_model(shrunk(1.0)).effects(viewer="gsplat").near_plane == 0.01
+    assert wrap_model(shrunk(0.02), cameras=tiny.cameras()).effects().near_plane == 0.2
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_few_splats_are_no_small_scene(count):
+    """Whose centers say nothing about its size: one was looked at from within."""
+    splats = tiny.gaussians(count)
+    model = VanillaModel.from_gaussians(replace(splats, means=1e-3 * splats.means))
+    assert wrap_model(model).effects().near_plane == 0.2
 
 
 def test_things_far_apart_are_told_of_where_an_orbit_shows_them_as_specks():

@@ -84,5 +84,5 @@ def test_what_is_adapted_is_seen_from_the_same_places(tmp_path):
         model.parameters()["means"].copy_(capture())
         model.parameters()["scales"].fill_(-2.7)
     file = wrap_model(model).adapt(1 / 4, recipe="instant", extra_views=4).save(tmp_path / "adapted.ply")
-    base, adapted = orbit_of(model, None), orbit_of(wrap_model(file).model, None)
+    base, adapted = orbit_of(model, model.trained), orbit_of(wrap_model(file).model, model.trained)
     assert 0 < base.nearest < base.distance and adapted == base
