@@ -13,6 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from mipmap_plugin.adaptation.start.base_weights import ON_HIDDEN
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.warn import held, warn
 from mipmap_plugin.errors import SettingsError
@@ -92,6 +93,7 @@ class _Work:
     store: LevelStore
     yardstick: Yardstick
     said: list[str] = field(default_factory=list)  # what the level that was made last warned of
+    told: list[str] = field(default_factory=list)  # what was warned of
 
     def levels(self, band: Band) -> tuple[list[Level], list[LeftOut], float]:
         """The levels, those that are left out because they are no use as coarser ones, and the zoom down to which there was one made."""
@@ -147,9 +149,11 @@ class _Work:
         return level
 
     def _tell(self) -> None:
-        """Warn of what the level that was made last warned of, now that it is kept."""
+        """Warn of what the level that was made last warned of, now that it is kept. That no view shows many splats is said of the scene, once."""
         for text in self.said:
-            warn(text)
+            if not (text.endswith(ON_HIDDEN) and any(told.endswith(ON_HIDDEN) for told in self.told)):
+                warn(text)
+                self.told.append(text)
 
     def _suffices(self, level: Level) -> bool:
         """Whether a level is as good as requested at the ends of its band."""

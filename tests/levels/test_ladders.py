@@ -14,10 +14,8 @@ from brief_levels import BRIEF, request, wrapped
 
 from mipmap_plugin import cli, load_model, wrap_model
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report
-from mipmap_plugin.adaptation.warn import held, warn
 from mipmap_plugin.commands.ladder_summary import print_summary
 from mipmap_plugin.errors import OutputExists, SettingsError
-from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.contents import LeftOut, Level
 from mipmap_plugin.levels.ladder import NO_FEWER, NOT_BETTER, UNSHOWN, _no_use, _shown, _Work, make_levels
 from mipmap_plugin.levels.manifest import MANIFEST, THREE_JS, TOLD, base_pixel, looked_at, read_manifest, refuse_ladder, view_pixel
@@ -50,27 +48,6 @@ def test_a_level_that_is_the_base_again_is_left_out(tmp_path, monkeypatch, capsy
     assert [level["file"] for level in manifest["levels"]] == ["level_0.ply", "level_1.ply"] and not (tmp_path / "ladder/level_2.ply").exists()
     print_summary(tmp_path, manifest)
     assert f"no level of its own at x0.5, where a neighbor is shown: {NOT_BETTER}" in capsys.readouterr().out
-
-
-def test_only_of_levels_that_are_kept_is_anything_warned(monkeypatch, recwarn):
-    base, adapt = wrapped(), FrozenBase.adapt
-
-    def warning(self, scale, **options):
-        warn(f"x{scale:g} looks worse")
-        return adapt(self, scale, **options)
-
-    monkeypatch.setattr(FrozenBase, "adapt", warning)
-    monkeypatch.setattr("mipmap_plugin.levels.ladder._no_use", lambda level, *_: NO_FEWER if 0.4 < level.band.scale < 0.6 else None)
-    ladder = make_levels(base, request())
-    assert [left.scale for left in ladder.contents.left_out] == pytest.approx([1 / 2])
-    assert [str(each.message) for each in recwarn if "looks worse" in str(each.message)] == ["x1 looks worse", "x0.25 looks worse"]
-
-
-def test_what_a_level_that_fails_warned_of_is_told(recwarn):
-    with pytest.raises(SettingsError), held():
-        warn("the cameras may be of another scene")
-        raise SettingsError("nothing is drawn")
-    assert [str(each.message) for each in recwarn] == ["the cameras may be of another scene"]
 
 
 @pytest.mark.parametrize(

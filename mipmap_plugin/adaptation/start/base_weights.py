@@ -19,6 +19,9 @@ from mipmap_plugin.render_settings import MIN_ALPHA
 # The user is told if a larger fraction of the splats is shown by no view, since dB say nothing of these. In captures it is up to a quarter.
 HIDDEN = 1 / 3
 
+# What the user is told of them, after how many they are.
+ON_HIDDEN = "of which the dB say nothing: give cameras that show all of the scene, or look at it from where these do"
+
 # Up to this scale views are weighed at half of their size: their pixels are still at most half as wide as the target's, and objects and captures end
 # within 0.05 dB of what they would, in half to two thirds of the time for weighing. At a quarter of the size flowers and chair lose 0.1 dB at x1/4.
 FAR, HALF = 1 / 4, 1 / 2
@@ -102,5 +105,4 @@ def note_on_hidden(shown: Tensor, opacities: Tensor) -> list[str]:
     """That views show too little of the splats, of which they show those that are True in `shown` [N], in a sentence; none if they show enough."""
     if not (hidden := float((~shown)[opacities >= MIN_ALPHA].float().mean())) > HIDDEN:
         return []
-    advice = "give cameras that show all of the scene, or look at it from where these do"
-    return [f"no view shows {hidden:.0%} of the splats, of which the dB say nothing: {advice}"]
+    return [f"no view shows {hidden:.0%} of the splats, {ON_HIDDEN}"]

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -87,12 +87,17 @@ class LevelRun:
         self.shares = ImageStore(LIMIT, self.finest.means)
         self.truth = lambda view: truth(view) * self._share(view)
         self.validation = Validation(steering, choosing, 1.0, self.truth, [self._render], self.config.resize)
+        self.whole = replace(self.validation, truth=truth, renders=[self._picture])
         self.fixed, self.mixture = 0, self.unmerged
 
-    def _render(self, splats: Gaussians, camera: Camera) -> Tensor:
-        """A view in which the level is shown where the viewer shows it, and all other levels elsewhere; each pixel counts by its share."""
+    def _picture(self, splats: Gaussians, camera: Camera) -> Tensor:
+        """A view in which the level is shown where the viewer shows it, and all other levels elsewhere."""
         drawn = self.mixture.with_student(self.number, splats, camera, self.fixed)
-        return self.scene.backend.render(drawn, camera, self.scene.target).image * self._share(camera)
+        return self.scene.backend.render(drawn, camera, self.scene.target).image
+
+    def _render(self, splats: Gaussians, camera: Camera) -> Tensor:
+        """The picture of a view, in which each pixel counts by the level's share of it."""
+        return self._picture(splats, camera) * self._share(camera)
 
     @torch.no_grad()
     def _share(self, camera: Camera) -> Tensor:
@@ -127,8 +132,8 @@ class LevelRun:
             self.seconds["optimization"] = run.watch.seconds - self.seconds["total"] - run.costs.seconds()
             curve, kept, self.seconds["total"] = run.curve, keeper.remaining_file(), run.watch.seconds
         with announced(f"level {self.number}: validation"):
-            best, psnrs, *_ = self.validation.choose(states)
-            psnrs[AS_FINER] = self._as_finer(lambda finer: self.validation.viewer_psnrs(finer, self.validation.choosing)[0])
+            best, psnrs, *_ = self.whole.choose(states)  # by whole pictures, as whoever walks there sees them
+            psnrs[AS_FINER] = self._as_finer(lambda finer: self.whole.viewer_psnrs(finer, self.whole.choosing)[0])
         report = self._report(states[best], curve, ended_by, best, psnrs)
         effects = {str(self.scene.request.viewer): self.scene.target}
         return Adapted(states[best], report, self.scene.backend, self.scene.target, effects, [kept] if kept else [], self.views, self.scene.views)
