@@ -72,7 +72,7 @@ FAMILIES = {
 
 @pytest.mark.parametrize(("family", "scale"), [*((family, 1 / 2) for family in FAMILIES), ("3dgs", 2), ("2dgs", 2)])
 def test_each_family_adapts_and_is_saved_there(family, scale, tmp_path, monkeypatch):
-    for compiled in ("start.closed_form.summed_areas", "pixel_size.finest_pixels"):  # which are a little more exact
+    for compiled in ("start.closed_form.summed_areas", "views.pixel_size.finest_pixels"):  # which are a little more exact
         monkeypatch.setattr(f"mipmap_plugin.adaptation.{compiled}", lambda *_: None)
     model = load_model(FAMILIES[family](tmp_path / "base"))
     settings = dict(FEW, steps=2 if family == "3dgs" else 1, prune_every=1, check_every=1)

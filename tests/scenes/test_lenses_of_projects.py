@@ -122,7 +122,7 @@ def test_applied_transform_is_taken_back_for_some_of_the_views_and_not_for_camer
 
 
 def test_thousands_of_cameras_tell_their_world_without_a_number_for_each_pair(tmp_path, monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.adaptation.target.photographs.LOOKED_AT", 8)
+    monkeypatch.setattr("mipmap_plugin.adaptation.views.placing.LOOKED_AT", 8)
     views = tiny.cameras(60)
     scene = Scene(tuple(view.moved(APPLIED) for view in views), {}, tmp_path, [], applied=APPLIED)
     with Largest() as largest:
