@@ -154,11 +154,14 @@ def _plausible_splat(head: bytes, size: int, named: bool) -> bool:
     """Whether the file consists of complete records with values that are plausible for splats, and is no text, such as a mesh in an .obj.
 
     `named`: it is called .splat. Then quaternions may be of any length, as converters of point clouds write them, whose round splats look
-    alike however they are turned, and sizes may be 0.
+    alike however they are turned, sizes may be 0, and less than half of the records may hold no numbers (`without_invalid` leaves these out).
     """
     if size % SPLAT_RECORD.itemsize or head.isascii():
         return False
     rows = np.frombuffer(head[: len(head) // SPLAT_RECORD.itemsize * SPLAT_RECORD.itemsize], SPLAT_RECORD)
+    if named:
+        finite = np.isfinite(rows["position"]).all(axis=1) & np.isfinite(rows["scale"]).all(axis=1)
+        rows = rows[finite] if finite.mean() > 0.5 else rows
     scale = rows["scale"]
     if not (np.isfinite(rows["position"]).all() and (scale >= 0).all() and (scale < 1e6).all()):
         return False

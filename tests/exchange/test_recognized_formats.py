@@ -14,6 +14,7 @@ from ply_files import write, write_splats
 from zip_files import archive
 
 from mipmap_plugin.errors import CheckpointError, OutputError
+from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.splat_transform import reason_in
 from mipmap_plugin.models import detect, load_model
@@ -80,6 +81,13 @@ def test_what_is_doubtful_in_what_the_tool_made_of_a_file_is_said_of_the_file(tm
     with pytest.warns(UserWarning) as caught:
         load_model(tmp_path / "a.spz")
     assert [str(each.message).split(":")[0] for each in caught] == [f"{tmp_path / 'a.spz'}, as splat-transform reads it"]
+
+
+@pytest.mark.parametrize(("lost", "kind"), [(1, "splat"), (2, "unknown")])
+def test_a_splat_file_may_hold_some_records_without_numbers(tmp_path, lost, kind):
+    """As its converters leave them where a training did; they are left out like those of a PLY."""
+    (tmp_path / "a.splat").write_bytes(RECORD * (3 - lost) + (b"\xff" * 12 + RECORD[12:]) * lost)
+    assert kind_of(tmp_path / "a.splat") == kind
 
 
 def test_compressed_ply_is_recognized_by_its_columns(tmp_path, tool):
