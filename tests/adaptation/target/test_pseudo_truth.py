@@ -10,6 +10,7 @@ from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
+from mipmap_plugin.adaptation.views import policy as policies
 from mipmap_plugin.adaptation.views.policy import choose_views, extent
 from mipmap_plugin.adaptation.views.schedule import ViewSchedule
 from mipmap_plugin.adaptation.views.viewpoints import Viewpoints
@@ -138,10 +139,10 @@ def test_an_orbit_that_is_asked_for_samples_as_densely_as_the_cameras():
     assert which == f"5 views of a generated orbit at {views[0].width} px (as requested)"
 
 
-@pytest.mark.parametrize("asked", ["given", "train", "test", "orbit", "jittered"])
-def test_without_cameras_there_is_an_orbit(asked):
-    (views, which), _ = chosen(asked, cameras=[], extra_views=5)
-    assert which == f"5 views of a generated orbit at {views[0].width} px (the checkpoint came without cameras)"
+@pytest.mark.parametrize("policy", ["given", "train", "test", "orbit", "jittered"])
+def test_without_cameras_there_is_an_orbit(policy):
+    (views, which), _ = chosen(policy, cameras=[], extra_views=5)
+    assert which == f"5 views of a generated orbit at {policies.ORBIT_PIXELS} px (the checkpoint came without cameras)"
     assert len(views) == 5
 
 
