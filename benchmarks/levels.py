@@ -223,7 +223,8 @@ def shows(base: Wrapped, viewer: str, ladder: Path, folder: Path) -> list[Show]:
         print(f"{TOOL} is not found, so that its levels are left out", file=sys.stderr)
         return found
     counts = [level["splats"] for level in manifest["levels"][1:]]
-    files = [decimated(tool, source, count, folder / f"rival_{count}.ply") for count in counts]
+    made = {count: decimated(tool, source, count, folder / f"rival_{count}.ply") for count in set(counts)}  # two levels may have as many
+    files = [made[count] for count in counts]
     megabytes = sum(file.stat().st_size for file in (source, *files)) / 1e6
     return [*found, Show(TOOL, [base.model, *(load_model(file) for file in files)], switches, megabytes)]
 

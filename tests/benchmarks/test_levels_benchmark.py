@@ -1,11 +1,13 @@
 """The dolly benchmark's own parts: exact zooms, whole frames, flicker that only what is wrong makes, and a page from measured films."""
 
+import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import tiny
 import torch
-from levels import Dolly, Show, at, changes, film, middle
+from levels import MANIFEST, Dolly, Show, at, changes, film, middle, shows
 from levels_counts import Row
 from levels_counts import page as page_of_counts
 from levels_page import HEIGHT, WORDS, draw, page, strip
@@ -46,6 +48,19 @@ def test_the_base_at_its_own_scale_is_the_truth_and_does_not_flicker(dolly):
     assert measured.frames[0].psnr_db > 60 and measured.frames[0].flicker is None
     assert measured.frames[-1].psnr_db < 40 and measured.frames[-1].flicker > 0
     assert [frame.zoom for frame in measured.frames] == pytest.approx([1, 1 / 4, 1 / 16])
+
+
+def test_the_rival_makes_one_file_for_levels_of_as_many_splats(tmp_path, monkeypatch):
+    """Its program refuses to write a file again."""
+    base, made = wrap_model(tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12), count=12), backend="reference"), []
+    levels = [{"file": base.model.source.name, "splats": count, "bytes": 1} for count in (12, 6, 6, 3)]
+    (tmp_path / MANIFEST).write_text(json.dumps({"levels": levels, "switches": []}))
+    (tmp_path / base.model.source.name).write_bytes(base.model.source.read_bytes())
+    monkeypatch.setattr("levels.find_tool", lambda: ["tool"])
+    monkeypatch.setattr("levels.decimated", lambda tool, source, count, output: (made.append(count), source)[1])
+    monkeypatch.setattr(type(base), "adapt", lambda *_, **__: SimpleNamespace(save=lambda _: base.model.source))
+    found = shows(base, "classic", tmp_path, tmp_path)
+    assert sorted(made) == [3, 6] and len(found[-1].files) == 4
 
 
 @pytest.fixture
