@@ -92,7 +92,8 @@ class LevelStore:
             raise SettingsError(f"{file}: this level of an unfinished ladder is damaged ({brief(error)}); delete its folder to start anew") from error
         plain: SplatModel = cast(Filtered, read).bare() if read.traits.filtered else read  # the filter of a file for Mip-Splatting is 0
         model = plain.to(self._base.model.parameters()["means"].device)
-        model.trained = self._base.trained.drawn_with(self._target)
+        near_plane = self._base.model.trained.near_plane  # of the training: that of a small scene without cameras is nearer in `trained`
+        model.trained = replace(self._base.trained.drawn_with(self._target), near_plane=near_plane)
         backend, _ = self._base.backend(viewer=report.viewer)
         return Adapted(model, report, backend, self._target, {str(report.viewer): self._target}, cameras=self._base.views())
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,6 +27,9 @@ FUSED = "its name says that a 3D filter is fused into it; if Mip-Splatting train
 # Of a file with more rows of zeros than this fraction a part is missing: a download, or a copy, has not ended. Drawn, such a row is a gray ball of
 # size 1 at the origin, and no training writes one, for the quaternion of a splat has a length.
 MOST_BLANK = 0.01
+
+# Why the others are left out.
+BLANK = "they hold nothing but zeros"
 
 
 def load_vanilla(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
@@ -62,15 +65,26 @@ def read_splats(checkpoint: Checkpoint, kind: type[Model], *networks: Path) -> M
 
 
 def _without_blank(model: Model, path: Path) -> Model:
-    """The model without rows of zeros, with a note. Raises CheckpointError if there are many (MOST_BLANK)."""
-    raw = [tensor.detach().flatten(1) if tensor.dim() > 1 else tensor.detach()[:, None] for tensor in model.parameters().values()]
-    blank = (model.parameters()["quats"].detach() == 0).all(1)
+    """The model without rows of zeros, with a note. Raises CheckpointError if there are many (`refuse_blank`)."""
+    blank = blank_rows(model.parameters())
+    refuse_blank(blank, path)
+    return drop(model, blank, BLANK, path) if blank.any() else model
+
+
+def blank_rows(parameters: Mapping[str, Tensor]) -> Tensor:
+    """Which rows of a file, of whose columns these raw parameters are, hold nothing but zeros, [N] bool."""
+    raw = [tensor.detach().flatten(1) if tensor.dim() > 1 else tensor.detach()[:, None] for tensor in parameters.values()]
+    blank = (parameters["quats"].detach() == 0).all(1)
     blank[blank.clone()] = torch.stack([(tensor[blank] == 0).all(1) for tensor in raw]).all(0)
+    return blank
+
+
+def refuse_blank(blank: Tensor, path: Path) -> None:
+    """Raise CheckpointError if more rows than MOST_BLANK are `blank` [N]."""
     count = int(blank.sum())
-    if count > MOST_BLANK * len(model):
-        missing = f"{some_of(count, len(model), 'row', 'hold')} nothing but zeros"
+    if count > MOST_BLANK * len(blank):
+        missing = f"{some_of(count, len(blank), 'row', 'hold')} nothing but zeros"
         raise CheckpointError(f"{path} is not whole: {missing}, as where a download or a copy has not ended; download or copy it again")
-    return drop(model, blank, "they hold nothing but zeros", path) if count else model
 
 
 def without_invalid(model: Model) -> Model:

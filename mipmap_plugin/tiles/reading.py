@@ -17,6 +17,7 @@ from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.models import Checkpoint, detect
 from mipmap_plugin.models.columns import DC, RGB, extra_names, has_bright_colors, second_colors
 from mipmap_plugin.models.health import MIN_DISTRIBUTION, doubts, dropped, examine, refuse_few
+from mipmap_plugin.models.reading import BLANK, blank_rows, refuse_blank
 from mipmap_plugin.models.surfels import SurfelModel
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.tiles.cut import cut
@@ -55,8 +56,10 @@ def make_cut(path: Path, tiles: int, folder: Path) -> None:
     found = _Found()
     write_pieces(folder / BASE, len(rows), (found(kind, part, rows.path) for part in _read(rows)))
     splats = Splats.of(kind, [Store(folder / BASE)])
-    valid = torch.cat(found.valid)
-    refuse_few(~valid, checkpoint.path)
+    blank, finite = torch.cat(found.blank), torch.cat(found.finite)
+    refuse_blank(blank, checkpoint.path)
+    refuse_few(~finite, checkpoint.path)
+    valid = finite & ~blank
     kept = valid.nonzero()[:, 0]
     if len(kept) < tiles:
         advice = "leave --tiles out" if len(kept) < FEWEST else "give fewer"
@@ -67,7 +70,8 @@ def make_cut(path: Path, tiles: int, folder: Path) -> None:
     told = found.doubts(len(rows))
     for doubt in told:
         warn(f"{checkpoint.path}: {doubt}")
-    told += [] if valid.all() else [dropped(~valid, "splat", "not finite once activated", checkpoint.path)]
+    left_out = {BLANK: blank, "not finite once activated": ~finite}
+    told += [dropped(rows_out, "splat", why, checkpoint.path) for why, rows_out in left_out.items() if rows_out.any()]
     told += second_colors(rows.header.vertex.names)
     degree_at = found.degree_at if found.highest >= 0 else int(kept[0])
     sample = torch.cat([kept[:: -(-len(kept) // SAMPLE)], torch.tensor([degree_at])]).unique()
@@ -91,10 +95,11 @@ def _parts(rows: PlyRows) -> Iterator[dict[str, Any]]:
 
 
 class _Found:
-    """Which splats are finite, whether one is drawn, one that has the highest SH band that is not zero, and columns that tiles do not hold."""
+    """Which splats are finite, which rows are blank, whether one is drawn, one with the highest SH band that is used, and columns that tiles lack."""
 
     def __init__(self) -> None:
-        self.valid: list[Tensor] = []
+        self.finite: list[Tensor] = []
+        self.blank: list[Tensor] = []
         self.degree_at, self.highest, self.drawn = 0, -1, False
         self.rounded, self.step = 0, 0.0  # as of `Health`; the largest step
         self.looks: list[tuple[bool, bool]] = []  # whether scales look linear, and opacities activated, where so many splats say anything
@@ -105,15 +110,16 @@ class _Found:
         parameters = kind.parameters_of(columns, path)
         self.extras.update(extra_names(columns))
         health = examine(kind(parameters))
-        valid = ~health.invalid
+        finite = ~health.invalid
         self.drawn |= health.invisible < health.splats
         self.rounded, self.step = self.rounded + health.rounded, max(self.step, health.step)
-        used = (parameters["shN"].abs().amax(dim=2) > 0) & valid[:, None]
+        used = (parameters["shN"].abs().amax(dim=2) > 0) & finite[:, None]
         if used.any():
             row, band = used.nonzero()[used.nonzero()[:, 1].argmax()].tolist()
             if band > self.highest:
-                self.degree_at, self.highest = sum(map(len, self.valid)) + row, band
-        self.valid.append(valid)
+                self.degree_at, self.highest = sum(map(len, self.finite)) + row, band
+        self.finite.append(finite)
+        self.blank.append(blank_rows(parameters))
         if health.splats >= MIN_DISTRIBUTION:
             self.looks.append((health.scales_look_linear, health.opacities_look_activated))
         return parameters

@@ -35,7 +35,7 @@ FORMED, MERGED = "formed", "merged"
 
 
 class StartSearch:
-    """Tries the starts of `adaptation.start.candidates` on the whole scene, and leaves the best in its folder."""
+    """Tries the starts of `adaptation.start.search` on the whole scene, and leaves the best in its folder."""
 
     def __init__(self, scene: TiledScene) -> None:
         self.scene, self.truths = scene, Truths(scene)

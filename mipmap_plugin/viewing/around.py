@@ -27,8 +27,8 @@ PIXELS, BASE_PIXELS = 120_000, 400_000
 
 def views_for_screen(base: Wrapped, screen: Camera, look_at: Tensor, scale: float) -> list[Camera]:
     """Views of the base's scale to adapt to for what `screen`, a camera of the new scale, shows around the point `look_at` [3]."""
-    means = means_at(base.model, screen)
-    near = [part(turned(screen, look_at, number), means, scale, number).zoomed(1 / scale) for number in range(NEAR)]
+    means, plane = means_at(base.model, screen), base.effects().near_plane
+    near = [part(turned(screen, look_at, number), means, plane, scale, number).zoomed(1 / scale) for number in range(NEAR)]
     given = base.cameras or base.viewpoints.best(evenly(base.views(), OWN))
     train = [view for view in given if view.split == "train"] or given
     own = [middle(view, PIXELS / scale**2) for view in evenly(train, OWN)]
@@ -51,11 +51,14 @@ def middle(view: Camera, pixels: float) -> Camera:
     return view.window(max(1, int(fraction * view.width)), max(1, int(fraction * view.height)))
 
 
-def part(view: Camera, means: Tensor, scale: float, number: int) -> Camera:
-    """A part of a view of the new scale around one of the splats in it, another for each number; `means` [N, 3]: their centers."""
+def part(view: Camera, means: Tensor, near: float, scale: float, number: int) -> Camera:
+    """A part of a view of the new scale around one of the splats in it, another for each number.
+
+    `means`: [N, 3], the centers of all splats; `near`: the near plane, both in world units.
+    """
     fraction = min(1.0, math.sqrt(min(PIXELS, BASE_PIXELS * scale**2) / (view.width * view.height)))
     width, height = (max(1, int(fraction * side)) for side in (view.width, view.height))
-    seen = inside(means, view).nonzero()[:, 0]
+    seen = inside(means, view, near).nonzero()[:, 0]
     x, y = view.width / 2, view.height / 2
     if len(seen):
         place = view.to_camera(means[seen[int(len(seen) * (GOLDEN * number % 1))]][None])[0].tolist()

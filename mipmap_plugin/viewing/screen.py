@@ -11,7 +11,6 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.views.pixel_size import pixel_size
 from mipmap_plugin.camera import Camera, evenly, viewmat_of
-from mipmap_plugin.effects import NEAR_PLANE
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import MAX_SCALE, MIN_SCALE
 from mipmap_plugin.splatting.rotations import quaternions, rotations
@@ -57,8 +56,9 @@ class OnScreen:
 class Sampling:
     """How finely the training sampled each splat of the base, so that a screen can be compared with it."""
 
-    def __init__(self, means: Tensor, views: Sequence[Camera]) -> None:
-        """`means`: [N, 3] world units; `views`: of the training, at its scale."""
+    def __init__(self, means: Tensor, views: Sequence[Camera], near: float) -> None:
+        """`means`: [N, 3] world units; `views`: of the training, at its scale; `near`: the near plane, in world units."""
+        self._near = near
         self.means = means.detach()[:: max(1, -(-len(means) // MOST_SPLATS))]
         self._pixels = pixel_size(self.means, views)  # in the closest view, so that most views sample more coarsely
         typical = torch.tensor([self.of(view).zoom for view in evenly(views, MOST_VIEWS)]).median()
@@ -71,7 +71,7 @@ class Sampling:
 
     def of(self, camera: Camera) -> OnScreen:
         """The zoom of a camera, and the depth of what it shows; the splats are counted among those looked at (`inside` counts all)."""
-        seen = inside(self.means, camera)
+        seen = inside(self.means, camera, self._near)
         if not seen.any():
             return OnScreen(0, 1.0, 1.0)
         depths = camera.to_camera(self.means[seen])[:, 2]
@@ -79,9 +79,9 @@ class Sampling:
         return OnScreen(int(seen.sum()), min(max(float(zooms.median()), MIN_SCALE), MAX_SCALE), float(depths.median()))
 
 
-def inside(means: Tensor, camera: Camera) -> Tensor:
-    """Which centers [N, 3] lie inside the picture, [N] bool."""
-    return camera.in_picture(camera.to_camera(means), NEAR_PLANE)
+def inside(means: Tensor, camera: Camera, near: float) -> Tensor:
+    """Which centers [N, 3] lie inside the picture, farther than the near plane (world units), [N] bool."""
+    return camera.in_picture(camera.to_camera(means), near)
 
 
 def pose_of(camera: Camera, depth: float) -> Pose:

@@ -73,7 +73,7 @@ class File:
         """How many splats lie inside the picture, and how many there are."""
         model = self._model.model
         means = model.parameters()["means"] if model.traits.same_for_all_views else model.gaussians(request.camera).means
-        return int(inside(means, request.camera).sum()), len(means)
+        return int(inside(means, request.camera, self._model.effects().near_plane).sum()), len(means)
 
 
 class Supersampled(File):
@@ -143,7 +143,7 @@ def _levels(folder: Path) -> list[tuple[float, str]]:
 
 def of_adapted(name: str, adapted: Adapted, base: Wrapped) -> File:
     """What an adaptation returned."""
-    trained = replace(adapted.model.trained, background=base.trained.background)
+    trained = replace(adapted.model.trained, background=base.trained.background, near_plane=base.trained.near_plane)
     return File(name, Wrapped(adapted.model, base.cameras, adapted.backend.name, trained))
 
 

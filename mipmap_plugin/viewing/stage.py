@@ -51,7 +51,7 @@ class Stage:
         """`others`: the base itself among them; `reference`: what adapting aims at."""
         self.base, self.reference = base, reference
         views, self._device = base.views(), base.model.parameters()["means"].device
-        self.sampling = Sampling(means_at(base.model, views[0]), views)
+        self.sampling = Sampling(means_at(base.model, views[0]), views, base.effects().near_plane)
         self.sources: dict[str, Source] = {}
         for source in (*others, reference):
             self.add(source)

@@ -19,7 +19,8 @@ from mipmap_plugin.formats import staging
 from mipmap_plugin.levels.ladder import make_levels
 from mipmap_plugin.levels.request import FINEST_RATIO
 from mipmap_plugin.levels.store import is_of
-from mipmap_plugin.wrap import Interrupted
+from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.wrap import Interrupted, Wrapped
 
 pytestmark = pytest.mark.usefixtures("brief_ladders", "few_views")
 
@@ -242,3 +243,13 @@ def test_a_ladder_that_was_changed_since_is_not_replaced(tmp_path):
     assert is_of(tmp_path / "state", ladder)
     (ladder / "levels.json").write_text("{}")
     assert not is_of(tmp_path / "state", ladder)
+
+
+@pytest.mark.filterwarnings("ignore:no cameras", "ignore:the scene is", "ignore:in ")
+def test_viewers_draw_the_kept_levels_of_a_small_scene_as_they_draw_its_base(tmp_path):
+    """With the near plane of their own they would draw nothing."""
+    splats = tiny.gaussians(12, degree=0)
+    base = wrap_model(VanillaModel.from_gaussians(replace(splats, means=0.01 * splats.means, scales=0.01 * splats.scales)))
+    [made] = make_levels(base, request("classic", coarsest=1.0), resume=tmp_path / "state").levels
+    level = Wrapped(made.adapted.model, base.cameras, "auto", base.trained)
+    assert level.effects(viewer="classic").near_plane == base.effects(viewer="classic").near_plane < 0.01

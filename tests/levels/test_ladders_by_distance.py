@@ -140,9 +140,9 @@ def test_what_takes_long_is_announced(small_chunks, monkeypatch):
 
 def test_a_level_that_is_worse_than_the_finer_one_says_so(small_chunks, monkeypatch):
     monkeypatch.setattr(LevelRun, "_as_finer", lambda *_: 99.0)
-    with pytest.warns(UserWarning, match=r"level_1 has .* dB where it is shown, where the finer level would have 99\.0, with more splats"):
+    with pytest.warns(UserWarning, match=r"level_1: pictures in which it is shown have .* dB, and 99\.0 with the finer level in its place"):
         report = wrapped().levels("classic", by="distance", coarsest=1 / 2, ratio=2.0, **BRIEF).contents.levels[1].report
-    assert report.validation[AS_FINER] == 99.0 and any(note.startswith("level_1 has") for note in report.notes)
+    assert report.validation[AS_FINER] == 99.0 and any(note.startswith("level_1:") for note in report.notes)
 
 
 def test_a_level_at_the_end_that_is_the_finer_one_again_is_left_out(tmp_path, small_chunks, monkeypatch, capsys):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import tiny
 import torch
-from their_families import BRIEF, Theirs, wrapped
+from their_families import BRIEF, Theirs, model, wrapped
 
 from mipmap_plugin import load_model, register_model, wrap_model
 from mipmap_plugin.backends.reference import ReferenceBackend
@@ -69,6 +69,15 @@ def test_what_a_family_does_wrong_is_told_by_its_name(gaussians, said):
         base.render(base.cameras[0])
     with pytest.raises(PluginError, match=said):
         wrapped(gaussians=gaussians).adapt(0.5, **BRIEF)
+
+
+def test_what_a_family_does_wrong_to_a_small_scene_is_told_by_its_name():
+    """Whose splats are looked at as it is wrapped."""
+    small = model(gaussians=lambda self, camera=None: None)
+    with torch.no_grad():
+        small.parameters()["means"].mul_(0.01)
+    with pytest.raises(PluginError, match=r"family 'theirs': gaussians\(\) has to return Gaussians; it returned a NoneType"):
+        wrap_model(small)
 
 
 def opaque(self, camera=None):

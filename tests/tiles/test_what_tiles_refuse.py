@@ -57,6 +57,25 @@ def test_bands_that_the_loader_of_a_viewer_does_not_read_are_told_of(job):
         assert report(scene, file).notes
 
 
+def with_blank_rows(job, count):
+    """Of four times as many splats, of which the last `count` are not there yet."""
+    return rewritten(job, lambda columns: {name: np.append(np.tile(column, 4)[: 4 * len(column) - count], np.zeros(count, column.dtype))
+                                           for name, column in columns.items()})  # fmt: skip
+
+
+def test_a_download_that_has_not_ended_is_not_cut_either(job):
+    with_blank_rows(job, 4)
+    with pytest.raises(CheckpointError, match=r"is not whole: 4 of 320 rows hold nothing but zeros, as where a download"):
+        cut_in_three(job)
+
+
+def test_a_few_rows_of_zeros_are_in_no_tile(job):
+    file = with_blank_rows(job, 3)
+    with pytest.warns(UserWarning, match="3 of 320 splats were dropped: they hold nothing but zeros"):
+        scene, whole = cut_in_three(job), load_model(file)
+    assert sum(map(len, scene.cores)) == len(whole) == 317
+
+
 def test_places_that_float32_does_not_hold_are_told_of(job):
     rewritten(job, lambda columns: columns | {"x": columns["x"].astype(float) + 5e6})
     folder = work_folder(job.target)

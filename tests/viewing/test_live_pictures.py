@@ -17,9 +17,11 @@ from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import of_base_scale
+from mipmap_plugin.effects import NEAR_PLANE
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.models.base import why_no_viewer
-from mipmap_plugin.viewing.around import views_for_screen
+from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.viewing.around import NEAR, views_for_screen
 from mipmap_plugin.viewing.pace import COARSEST, MOVING_S, Pace
 from mipmap_plugin.viewing.screen import LARGEST_FOV, Sampling, by_distance, by_lens, inside, pose_of, up_of, zoomed
 from mipmap_plugin.viewing.sources import File, Levels, Request, Supersampled, of_adapted, open_source
@@ -28,7 +30,7 @@ from mipmap_plugin.viewing.stage import AMPLIFIED, Look, Stage
 
 @pytest.fixture
 def sampling(base):
-    return Sampling(base.model.parameters()["means"], base.views())
+    return Sampling(base.model.parameters()["means"], base.views(), NEAR_PLANE)
 
 
 # Cameras
@@ -48,7 +50,7 @@ def test_a_view_of_the_training_is_at_zoom_1_and_fewer_pixels_at_less(base, samp
     assert min(zooms) == pytest.approx(1, abs=0.25) and max(zooms) == pytest.approx(1, abs=0.25)
     view = base.cameras[0]
     assert sampling.of(view.zoomed(1 / 4)).zoom == pytest.approx(sampling.of(view).zoom / 4)
-    assert sampling.of(view).splats == int(inside(sampling.means, view).sum()) > 0
+    assert sampling.of(view).splats == int(inside(sampling.means, view, NEAR_PLANE).sum()) > 0
 
 
 def test_a_camera_that_sees_nothing_has_a_zoom(sampling, base):
@@ -89,7 +91,20 @@ def test_the_base_is_drawn_as_render_draws_it(stage, base, screen):
     assert torch.equal(stage.draw(Look("base"), screen).image, base.render(screen).image.clamp(0, 1))
     spark = stage.draw(Look("base", viewer="spark"), screen)
     assert torch.equal(spark.image, base.render(screen, viewer="spark").image.clamp(0, 1))
-    assert spark.splats == (int(inside(base.model.parameters()["means"], screen).sum()), 60) and spark.psnr_db is None
+    assert spark.splats == (int(inside(base.model.parameters()["means"], screen, NEAR_PLANE).sum()), 60) and spark.psnr_db is None
+
+
+@pytest.mark.filterwarnings("ignore:no cameras", "ignore:the scene is")
+def test_a_small_scene_without_cameras_is_seen_nearer_than_the_near_plane_of_3dgs():
+    """And so is what is adapted of it, which was drawn as nothing."""
+    splats = tiny.gaussians()
+    base = wrap_model(VanillaModel.from_gaussians(replace(splats, means=0.02 * splats.means, scales=0.02 * splats.scales)))
+    stage, screen = Stage(base, [File("base", base)], Supersampled("supersampled", base)), base.views()[0]
+    drawn = stage.draw(Look("base"), screen)
+    assert drawn.zoom == pytest.approx(1, abs=0.1) and drawn.splats[0] > 50
+    adapted = base.adapt(1 / 2, recipe="instant", extra_views=4)
+    assert torch.equal(of_adapted("new", adapted, base).render(Request(screen, 1.0)), adapted.render(screen).image)
+    assert len({view.cx for view in views_for_screen(base, screen.resized(1600, 1200), torch.zeros(3), 1.0)[:NEAR]}) > NEAR / 2
 
 
 @pytest.mark.parametrize("viewer", [None, "classic", "playcanvas"])

@@ -8,6 +8,7 @@ import pytest
 import torch
 from live_screen import wish
 
+from mipmap_plugin.effects import NEAR_PLANE
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.viewing import adapting
 from mipmap_plugin.viewing.adapting import Adapter, Live
@@ -40,7 +41,8 @@ def test_views_lie_around_the_screen_and_show_its_splats_but_are_not_its_own(bas
     shown = [view.zoomed(1 / 2) for view in near]
     assert all(view.width * view.height <= 1.01 * PIXELS and view.fx == pytest.approx(screen.fx, rel=0.01) for view in shown)
     assert all(view.width * view.height <= 1.01 * BASE_PIXELS for view in near)
-    assert all(inside(base.model.parameters()["means"], view).sum() > 2 for view in shown) and len({view.cx for view in shown}) > NEAR / 2
+    means = base.model.parameters()["means"]
+    assert all(inside(means, view, NEAR_PLANE).sum() > 2 for view in shown) and len({view.cx for view in shown}) > NEAR / 2
     assert views[NEAR:] and all(torch.equal(view.viewmat, base.cameras[number].viewmat) for number, view in enumerate(views[NEAR:]))
 
 

@@ -221,12 +221,12 @@ def too_small(views: Sequence[Camera], model: SplatModel, near: float, least: fl
 
 
 def in_small_units(model: SplatModel, near: float) -> str:
-    """That a scene is so small that it is seen with a nearer near plane, at `near`, than in its training, in a sentence; "" if it is not."""
+    """That a scene is so small that it is drawn with a nearer near plane, at `near`, than in its training, in a sentence; "" if it is not."""
     usual = model.trained.near_plane
     if near >= usual:
         return ""
-    wide = f"the scene is {units(extent_of(model.parameters()['means'].detach()), 2)} units wide, and is seen here from nearer"
-    return f"{wide} than {usual:g} units, where renderers of 3DGS draw nothing; if it is for one of these, {SCALE_UP}"
+    wide = f"the scene is {units(extent_of(model.parameters()['means'].detach()), 2)} units wide, and is drawn here nearer than"
+    return f"{wide} {usual:g} units, too, where renderers of 3DGS draw nothing; if it is for one of these, {SCALE_UP}"
 
 
 def hints(views: Sequence[Camera], model: SplatModel, near: float) -> list[str]:

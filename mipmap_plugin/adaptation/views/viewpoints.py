@@ -19,6 +19,8 @@ from mipmap_plugin.effects import Effects, colorless
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.adapted_scale import adapted_orbit
 from mipmap_plugin.models.base import SplatModel, TrainedScale, means_at
+from mipmap_plugin.models.contract import checked_splats
+from mipmap_plugin.plugin_errors import naming_any
 from mipmap_plugin.process.threads import side_by_side
 from mipmap_plugin.scenes.orbits import EVERY, Orbit, radius_if_small, sharp_size
 from mipmap_plugin.scenes.photographed import sizes
@@ -166,12 +168,17 @@ def near_plane_for(model: SplatModel, usual: float) -> float:
     """The near plane, in world units, of a model that came without cameras: as `usual`, or nearer for a small scene, which views are to frame.
 
     Objects of less than 0.6 units, as phones scan them in meters, were seen from too far away, and adapted to smaller pictures than was asked for.
+    Raises PluginError.
     """
     if model.traits.moves or not model.traits.same_for_all_views:
         return usual
     radius = radius_if_small(model.parameters()["means"].detach(), usual)
-    few = radius > 0 and REACH * float(sizes(model.gaussians(ONE_PIXEL).detach()).nanmedian()) > radius
-    return NEAR_SHARE * radius if radius and not few else usual
+    if not radius:
+        return usual
+    with torch.no_grad(), naming_any({f"family {model.family!r}": model}):
+        splats = checked_splats(model, ONE_PIXEL)
+    few = REACH * float(sizes(splats).nanmedian()) > radius
+    return usual if few else NEAR_SHARE * radius
 
 
 def everywhere(model: SplatModel) -> Tensor:

@@ -216,9 +216,9 @@ class LevelRun:
         )
 
     def _worse(self, best: str, psnrs: dict[str, float]) -> list[str]:
-        """A note, which is also a warning, on a level that has less dB than the finer one would where it is shown; none if it has not."""
+        """A note, which is also a warning, on a level with which pictures have less dB than with the finer one; none if they have not."""
         if psnrs[best] >= psnrs[AS_FINER] - HARM_DB:
             return []
-        figures = f"{psnrs[best]:.1f} dB where it is shown, where the finer level would have {psnrs[AS_FINER]:.1f}"
-        warn(note := f"level_{self.number} has {figures}, with more splats; more steps would better it")
+        figures = f"pictures in which it is shown have {psnrs[best]:.1f} dB, and {psnrs[AS_FINER]:.1f} with the finer level in its place"
+        warn(note := f"level_{self.number}: {figures}, which has more splats; more steps would better it")
         return [note]

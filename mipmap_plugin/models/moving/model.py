@@ -95,7 +95,7 @@ class MovingModel:
 
     @property
     def moves(self) -> bool:
-        """Whether the splats depend on time; `adaptation.views` then distributes times over cameras that have none."""
+        """Whether the splats depend on time; `adaptation.views.moments` then distributes times over cameras that have none."""
         return not self.field.is_still
 
     @property
