@@ -215,12 +215,12 @@ class Session:
         run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
         if run.step and self._draw_bands(run.student, used_degree(run.student)):  # of a start that was merged further than this one
             task = replace(self._task(run.student), max_splats=task.max_splats)
+        renderer = Renderer(self.backend, self.drawn.to_step[0])
 
         def after_step(run: Run) -> bool:
             keeper.save_if_due(run)
-            render = Renderer(self.backend, self.drawn.to_step[0]).of_model(run.student)
             try:
-                return observe is not None and ends_run(observe(run.step, run.watch.seconds, render))
+                return observe is not None and ends_run(observe(run.step, run.watch.seconds, renderer.of_model(run.student)))
             except KeyboardInterrupt:  # as between two steps
                 keeper.save_and_stop(run)
 
