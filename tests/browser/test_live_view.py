@@ -91,7 +91,7 @@ def image(png: bytes) -> torch.Tensor:
 def expected(base: Wrapped, shown: torch.Tensor, view: int, time: float | None = None) -> torch.Tensor:
     """The base as our own backend draws it from a view, in as many pixels, at a moment."""
     camera = base.cameras[view]
-    pose = pose_of(camera, Sampling(base.model.parameters()["means"], base.cameras).of(camera).depth)
+    pose = pose_of(camera, Sampling(base.model.parameters()["means"], base.cameras, base.effects().near_plane).of(camera).depth)
     return base.render(replace(pose.camera(shown.shape[1], shown.shape[0]), time=time)).image
 
 
