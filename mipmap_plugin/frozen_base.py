@@ -84,9 +84,9 @@ class FrozenBase:
     def effects(self, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1, viewer: str | None = None) -> Effects:
         """How this model is rendered at `scale`, or by the viewer of that name (`splatting.viewers`).
 
-        `screen_filter`: None for the filter of its training, a filter's name, or "scaled" for the training-free filter whose dilation
-        keeps its size in the world. Filters that integrate over the pixel dilate splats in this way too, because a classic model was
-        trained to look right with dilation. Raises SettingsError for an unknown viewer or filter, and for a viewer together with a filter.
+        `screen_filter`: None for the filter of its training, a filter's name, or "scaled" for the training-free filter whose dilation keeps its
+        size in the world. Filters that integrate over the pixel dilate splats so, too: a classic model was trained to look right with dilation.
+        The near plane of a small scene without cameras holds for all. Raises SettingsError for an unknown viewer or filter, and for both together.
         """
         check_kinds(screen_filter=(screen_filter, str))
         trained = self.trained
