@@ -225,8 +225,8 @@ def in_small_units(model: SplatModel, near: float) -> str:
     usual = model.trained.near_plane
     if near >= usual:
         return ""
-    wide = f"the scene is {units(extent_of(model.parameters()['means'].detach()), 2)} units wide, and is drawn here nearer than"
-    return f"{wide} {usual:g} units, too, where renderers of 3DGS draw nothing; if it is for one of these, {SCALE_UP}"
+    wide = f"the scene is {units(extent_of(model.parameters()['means'].detach()), 2)} units wide, so that splats nearer than"
+    return f"{wide} {usual:g} units are drawn here, too; renderers of 3DGS draw none of these: if the file is for one, {SCALE_UP}"
 
 
 def hints(views: Sequence[Camera], model: SplatModel, near: float) -> list[str]:

@@ -128,7 +128,8 @@ def test_a_scene_in_small_units_is_told_of_where_the_near_plane_keeps_views_away
 def test_a_small_scene_is_adapted_as_a_large_one_and_told_of(size):
     """As phones scan objects in meters: it was seen from too far away, and adapted to smaller pictures than was asked for, or refused."""
     usual = wrap_model(shrunk(1.0)).adapt(1 / 4, recipe="instant", extra_views=4)
-    with pytest.warns(UserWarning, match=r"drawn here nearer than 0\.2 units, too, where renderers of 3DGS draw nothing; if .* scale the scene up"):
+    told = r"nearer than 0\.2 units are drawn here, too; renderers of 3DGS draw none of these: if .* scale the scene up"
+    with pytest.warns(UserWarning, match=told):
         small = wrap_model(shrunk(size)).adapt(1 / 4, recipe="instant", extra_views=4)
     shapes = [adapted.model.parameters()["scales"].detach() for adapted in (usual, small)]
     assert len(small.model) == len(usual.model)
