@@ -17,6 +17,7 @@ from mipmap_plugin.commands.levels import print_summary
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.levels.distance.ladder import by_distance, scene_of
 from mipmap_plugin.levels.distance.level import AS_FINER, LevelRun
+from mipmap_plugin.levels.distance.walks import foreground
 from mipmap_plugin.levels.manifest import MANIFEST, read_manifest
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.levels.streamed import distances, progression
@@ -55,6 +56,16 @@ def test_a_ladder_from_end_to_end(tmp_path, small_chunks, capsys):
     assert sum(seconds.values()) == pytest.approx(2 * seconds["total"])  # of all phases
     print_summary(folder, manifest)
     assert "3 levels by distance" in capsys.readouterr().out
+
+
+def test_level_0_is_adapted_to_views_from_farther_back_too(small_chunks):
+    """Each view of the training once more, from where its nearest parts are at a scale down to the coarsest."""
+    base = wrapped()
+    scene = scene_of(base, request := LadderRequest.of("classic", by="distance", coarsest=1 / 4, **BRIEF), request.first_band(base))
+    depths, farther = ([foreground(view, scene.splats.means, 0.01) for view in views] for views in (scene.views, scene.farther()))
+    scales = [near / far for near, far in zip(depths, farther, strict=True)]
+    assert all(1 / 4 < scale < 1 for scale in scales) and max(scales) > 2 * min(scales)
+    assert base.levels("classic", by="distance", coarsest=1 / 4, **BRIEF).contents.levels[0].report.views.startswith("6 train views")
 
 
 def test_levels_by_distance_have_the_filter_of_pictures_of_full_size(small_chunks):

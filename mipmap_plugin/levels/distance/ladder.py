@@ -45,7 +45,9 @@ def make_levels_by_distance(base: FrozenBase, request: LadderRequest, resume: Pa
     with announced("cutting the scene into chunks"):
         scene = scene_of(base, request, band)
         store = LevelStore(resume, base, request)
-    first = store.level("level_0", lambda state: base.adapt(1.0, resume=state, **request.for_first(base, band)))
+    # Adapted to the views of the training alone, level 0 would be worse than the base wherever nobody trained: its far parts are in every level.
+    cameras = [*base.cameras, *scene.farther()] if base.cameras else None
+    first = store.level("level_0", lambda state: base.adapt(1.0, cameras=cameras, resume=state, **request.for_first(base, band)))
     with threads.limited_for(scene.backend, base.threads):
         levels = [first]
         for number in range(1, scene.rule.count):

@@ -96,3 +96,10 @@ class DistanceScene:
         way = max(0.0, size * mean_focal(view) - foreground(view, self.splats.means, self.target.near_plane))
         part = (number + 0.5) * GOLDEN**2 % 1 if number % 3 == 0 else 1.0
         return backed(view, part * way if math.isfinite(way) else 0.0)
+
+    def farther(self) -> list[Camera]:
+        """Every view once more, moved back until its nearest parts are at a scale from x1 to the ladder's coarsest: evenly in the logarithm."""
+        depths = [foreground(view, self.splats.means, self.target.near_plane) for view in self.views]
+        scales = [self.request.coarsest ** ((number + 0.5) * GOLDEN % 1) for number in range(len(depths))]
+        found = zip(self.views, depths, scales, strict=True)
+        return [backed(view, depth * (1 / scale - 1)) for view, depth, scale in found if math.isfinite(depth)]
