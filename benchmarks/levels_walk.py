@@ -27,6 +27,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mipmap_plugin import load_model, wrap_model
+from mipmap_plugin.adaptation.views.farther import backed, foreground
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.report import markdown
@@ -37,7 +38,7 @@ from mipmap_plugin.levels.distance.ladder import scene_of
 from mipmap_plugin.levels.distance.mixture import Mixture
 from mipmap_plugin.levels.distance.rule import DistanceRule
 from mipmap_plugin.levels.distance.scene import DistanceScene
-from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground
+from mipmap_plugin.levels.distance.walks import WalkTruth
 from mipmap_plugin.levels.manifest import CANVAS, MANIFEST
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.levels.streamed import distances, progression

@@ -34,10 +34,11 @@ from mipmap_plugin.adaptation.target.detail import DetailLoss, unused_upsampler
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import fitting
+from mipmap_plugin.adaptation.views.farther import some_farther
 from mipmap_plugin.adaptation.views.for_validation import WINDOW, split_validation
 from mipmap_plugin.adaptation.views.moments import at_their_moments, evaluate_moments
 from mipmap_plugin.adaptation.views.policy import choose_views, over_band
-from mipmap_plugin.adaptation.views.shown import hints, refuse_blind, remarks, showing, too_far_out
+from mipmap_plugin.adaptation.views.shown import hints, refuse_blind, remarks, telling, too_far_out
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.adaptation.worse import better_as_trained, worse_viewers, worse_views
 from mipmap_plugin.backends.base import Calls
@@ -86,11 +87,11 @@ class Session:
         """The views to adapt to, the views for validation, and a description of the former."""
         with self._looking():
             chosen, note = choose_views(cameras, replace(self.viewpoints, beside=True), self.config)
+            means, near = means_at(self.base, chosen[0]), self.drawn.base.near_plane
+            chosen, farther = some_farther(chosen, cameras, means, near) if self.scale == 1 and not self._orbits else (chosen, "")
             views, validation = split_validation(cameras, chosen, self.viewpoints, self.scale, self.config)
-        note += f", {len(chosen) - len(views)} of them kept for validation" if len(views) < len(chosen) else ""
-        shown = showing(validation, means_at(self.base, chosen[0]), self.drawn.base.near_plane)
-        if len(shown) > 1:  # one to steer by, and one to choose by; others are the same in every state
-            validation = shown
+        note += farther + (f", {len(chosen) - len(views)} of them kept for validation" if len(views) < len(chosen) else "")
+        validation = telling(validation, means, near)
         if self.base.traits.moves:
             moments = None if self._has_photographs else affordable_moments(self.config, self.base)  # a photograph shows no moment but its own
             views, validation, times = at_their_moments(views, validation, moments, self.config.seed)
@@ -270,8 +271,7 @@ class Session:
         notes = [*self.notes, *(note for note in student.notes if note not in known)]
         as_trained = psnr_as_trained(self.validation, self.backend, self.drawn.targets, self.base, self.drawn.base)
         shown = next((psnr for state, psnr in validation.items() if returned.startswith(state)), 0.0)
-        alone = as_trained if self.config.band == (1.0, 1.0) else None  # else it is a level of a ladder, which there is for viewers alone
-        notes += better_as_trained(alone, shown, self.drawn.base)
+        notes += better_as_trained(as_trained, shown, self.drawn.base) if self.config.band == (1, 1) else []  # a level is for viewers alone
         for note in notes:
             warn(note)
         return Report(

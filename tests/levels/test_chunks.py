@@ -7,11 +7,12 @@ from itertools import pairwise
 import pytest
 import tiny
 import torch
-from levels_by_distance import from_x, with_background, wrapped
+from levels_by_distance import from_x, wrapped
 from torch.overrides import TorchFunctionMode
 
 from mipmap_plugin import wrap_model
-from mipmap_plugin.adaptation.views.pixel_size import seen_pixel_size
+from mipmap_plugin.adaptation.views.farther import backed, foreground
+from mipmap_plugin.adaptation.views.pixel_size import nearest, seen_pixel_size
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -19,8 +20,8 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.levels.distance.chunks import Chunks, shrunk
 from mipmap_plugin.levels.distance.ladder import by_distance, scene_of
 from mipmap_plugin.levels.distance.mixture import Mixture, joined
-from mipmap_plugin.levels.distance.rule import DistanceRule, focal_along_shorter_side, is_unbounded, nearest
-from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground
+from mipmap_plugin.levels.distance.rule import DistanceRule, focal_along_shorter_side
+from mipmap_plugin.levels.distance.walks import WalkTruth
 from mipmap_plugin.levels.distance.yardstick import Walks
 from mipmap_plugin.levels.request import Band, LadderRequest
 from mipmap_plugin.models.vanilla import VanillaModel
@@ -78,12 +79,6 @@ def test_the_rule_follows_from_the_nearest_parts():
     assert rule.ends(rule.count - 1)[1] >= 0.01 * 8 > rule.ends(rule.count - 2)[1]
 
 
-def test_scenes_with_a_background_are_unbounded_and_objects_are_not():
-    views = tiny.cameras(6)
-    assert is_unbounded(with_background().means, views, 0.01)
-    assert not is_unbounded(tiny.gaussians(200).means, views, 0.01)
-
-
 def test_splats_in_no_picture_have_no_part_in_the_rule():
     """A third of the splats here lie right behind a camera, and one in ten right before it, nearer than the near plane."""
     views, ball = tiny.cameras(1, width=48, height=36), tiny.gaussians(300, degree=0)
@@ -97,10 +92,6 @@ def test_splats_in_no_picture_have_no_part_in_the_rule():
     rules = [scene_of(each, request, request.first_band(each)) for each in (base, cluttered)]
     assert rules[0].rule == rules[1].rule and rules[0].near == rules[1].near and rules[0].extent == rules[1].extent
     assert not by_distance(cluttered, replace(request, viewer="supersplat", by="auto"))
-
-
-def test_a_scene_that_no_camera_sees_is_not_unbounded():
-    assert not is_unbounded(torch.cat([torch.zeros(5, 3), torch.full((5, 3), 100.0)]), [from_x(1e6)], 0.01)
 
 
 def test_the_nearest_parts_are_found_where_few_of_many_views_see_something():
@@ -196,20 +187,6 @@ def test_walks_are_measured_with_the_chunks_that_are_streamed(small_chunks):
 
 
 # Walks
-
-
-def test_walking_back_moves_everything_away():
-    view, points = tiny.cameras(1)[0], tiny.gaussians().means
-    before, after = (camera.to_camera(points)[:, 2] for camera in (view, backed(view, 3.0)))
-    torch.testing.assert_close(after, before + 3.0, rtol=1e-4, atol=1e-4)
-
-
-def test_the_foreground_is_what_is_nearest_in_the_picture():
-    view, splats = tiny.cameras(1)[0], with_background()
-    depth = foreground(view, splats.means, 0.2)
-    assert 0.2 < depth < 10
-    assert foreground(backed(view, 5.0), splats.means, 0.2) > depth
-    assert foreground(view, view.center.float()[None] - 100 * view.viewmat[2, :3].float()[None], 0.2) == math.inf
 
 
 @pytest.mark.parametrize(("screen_filter", "eps2d"), [("classic", 0.3), ("antialiased", 0.3), ("mip", 0.1)])

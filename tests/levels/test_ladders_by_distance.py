@@ -13,11 +13,11 @@ from pages_read import record_of
 from mipmap_plugin import cli, load_model, wrap_model
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.validation import Validation
+from mipmap_plugin.adaptation.views.farther import foreground
 from mipmap_plugin.commands.levels import print_summary
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.levels.distance.ladder import by_distance, scene_of
 from mipmap_plugin.levels.distance.level import AS_FINER, LevelRun
-from mipmap_plugin.levels.distance.walks import foreground
 from mipmap_plugin.levels.manifest import MANIFEST, read_manifest
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.levels.streamed import distances, progression

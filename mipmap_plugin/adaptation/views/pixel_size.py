@@ -24,6 +24,12 @@ CLOSEST_OF = 4
 # all of them, with at most MOST_LOOKS tests for all such splats together, which take a second.
 RARE, MOST_LOOKS = 1 / 3, 1 << 23
 
+# The quantile of the sizes of pixels at a scene's splats that stands for its nearest parts. The smallest would be that of floaters before a camera.
+NEAREST = 0.05
+
+# A scene is unbounded if its pixels are more than this many times as large at its far parts as at its near ones: 1.3 times for lego, 16 for flowers.
+UNBOUNDED = 3.0
+
 # Splats that are counted in views, to tell how many views are enough.
 COUNTED = 1 << 14
 
@@ -106,6 +112,20 @@ def seen_pixel_size(means: Tensor, views: Sequence[Camera], near: float) -> Tens
     return seen[seen.isfinite()]
 
 
+def nearest(pixels: Tensor) -> float:
+    """The size of a pixel at the nearest parts of a scene, from the sizes [N] at its splats that are seen, at least one (`NEAREST`)."""
+    return float(_quantile(pixels, NEAREST))
+
+
+def is_unbounded(means: Tensor, views: Sequence[Camera], near: float) -> bool:
+    """Whether the near and the far parts of a scene need scales of their own; not if nothing is seen.
+
+    `means` [N, 3]; `views`: of its training; `near`: its near plane, in world units.
+    """
+    pixels = seen_pixel_size(means, views, near)
+    return len(pixels) > 0 and bool(_quantile(pixels, 1 - NEAREST) > UNBOUNDED * _quantile(pixels, NEAREST))
+
+
 def seen_depth(view: Camera, means: Tensor, near: float, part: float) -> float:
     """The depth, world units, before which this part of the splats at `means` [N, 3] in a view's picture lies; infinity if none is in it.
 
@@ -146,3 +166,8 @@ def _nearest(means: Tensor, views: Sequence[Camera]) -> Tensor:
     batches = in_batches(views, means)
     nearest = [((means - view.center).norm(dim=-1).clamp_min(least) / view.mean_focal).amin(0) for view in batches]
     return torch.stack(nearest).amin(0)
+
+
+def _quantile(values: Tensor, share: float) -> Tensor:
+    """As torch.quantile, which refuses more than 16 million values."""
+    return values.kthvalue(min(len(values), 1 + round(share * (len(values) - 1)))).values

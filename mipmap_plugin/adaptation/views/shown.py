@@ -90,6 +90,12 @@ def _inside(views: Sequence[Camera], means: Tensor, near: float) -> Iterator[Ten
         yield view.in_picture(view.to_camera(means.detach()), near)
 
 
+def telling(validation: Sequence[Camera], means: Tensor, near: float) -> list[Camera]:
+    """The views for validation that show something of splats at `means` [N, 3], or all if fewer than two do: one steers, and one chooses."""
+    shown = showing(validation, means, near)
+    return shown if len(shown) > 1 else list(validation)
+
+
 def seeing(cameras: Sequence[Camera], means: Tensor, near: float) -> list[Camera]:
     """The cameras that see something of splats at `means` [N, 3], with a warning of how many do not. `near`: the near plane, in world units.
 

@@ -10,16 +10,17 @@ from pathlib import Path
 import torch
 
 from mipmap_plugin.adaptation.adapted import Adapted
-from mipmap_plugin.adaptation.views.pixel_size import seen_pixel_size
+from mipmap_plugin.adaptation.views.farther import foreground
+from mipmap_plugin.adaptation.views.pixel_size import is_unbounded, nearest, seen_pixel_size
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.contents import LeftOut
 from mipmap_plugin.levels.distance.chunks import LEAST_OF_BASE, Chunks
 from mipmap_plugin.levels.distance.level import AS_FINER, LevelRun
 from mipmap_plugin.levels.distance.manifest import DistanceContents, manifest
-from mipmap_plugin.levels.distance.rule import DistanceRule, is_unbounded, nearest
+from mipmap_plugin.levels.distance.rule import DistanceRule
 from mipmap_plugin.levels.distance.scene import DistanceScene
-from mipmap_plugin.levels.distance.walks import foreground, mean_focal
+from mipmap_plugin.levels.distance.walks import mean_focal
 from mipmap_plugin.levels.distance.yardstick import measured
 from mipmap_plugin.levels.finished import Ladder
 from mipmap_plugin.levels.request import STREAMING, Band, LadderRequest

@@ -9,21 +9,14 @@ a level for pixels of size q is at the scale p / q: a near flower at x1/4, say, 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.views.pixel_size import seen_pixel_size
+from mipmap_plugin.adaptation.views.pixel_size import nearest
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.levels.request import Band, LadderRequest
-
-# The quantile of the sizes of pixels at a scene's splats that stands for its nearest parts. The smallest would be that of floaters before a camera.
-NEAREST = 0.05
-
-# A scene is unbounded if its pixels are more than this many times as large at its far parts as at its near ones: 1.3 times for lego, 16 for flowers.
-UNBOUNDED = 3.0
 
 
 @dataclass(frozen=True)
@@ -64,25 +57,6 @@ class DistanceRule:
         return canvas / 2 / math.tan(math.pi / 8) * self.first, self.ratio
 
 
-def nearest(pixels: Tensor) -> float:
-    """The size of a pixel at the nearest parts of a scene, from the sizes [N] at its splats that are seen, at least one (`NEAREST`)."""
-    return float(_quantile(pixels, NEAREST))
-
-
-def is_unbounded(means: Tensor, views: Sequence[Camera], near: float) -> bool:
-    """Whether the near and the far parts of a scene need scales of their own; not if nothing is seen.
-
-    `means` [N, 3]; `views`: of its training; `near`: its near plane, in world units.
-    """
-    pixels = seen_pixel_size(means, views, near)
-    return len(pixels) > 0 and bool(_quantile(pixels, 1 - NEAREST) > UNBOUNDED * _quantile(pixels, NEAREST))
-
-
 def focal_along_shorter_side(camera: Camera) -> float:
     """The focal length in px along the shorter side, which the rule is about."""
     return camera.fx if camera.width <= camera.height else camera.fy
-
-
-def _quantile(values: Tensor, share: float) -> Tensor:
-    """As torch.quantile, which refuses more than 16 million values."""
-    return values.kthvalue(min(len(values), 1 + round(share * (len(values) - 1)))).values

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.amount import affordable_for
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views.pixel_size import pixel_size, seen_pixel_size
+from mipmap_plugin.adaptation.views.farther import backed, foreground, stepping_back
+from mipmap_plugin.adaptation.views.pixel_size import nearest, pixel_size, seen_pixel_size
 from mipmap_plugin.adaptation.views.shown import seeing
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
@@ -21,8 +22,8 @@ from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance.chunks import Chunks
 from mipmap_plugin.levels.distance.coarsening import shaped
-from mipmap_plugin.levels.distance.rule import DistanceRule, nearest
-from mipmap_plugin.levels.distance.walks import backed, foreground, mean_focal
+from mipmap_plugin.levels.distance.rule import DistanceRule
+from mipmap_plugin.levels.distance.walks import mean_focal
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.recipes import recipe as make_config
@@ -98,8 +99,5 @@ class DistanceScene:
         return backed(view, part * way if math.isfinite(way) else 0.0)
 
     def farther(self) -> list[Camera]:
-        """Every view once more, moved back until its nearest parts are at a scale from x1 to the ladder's coarsest: evenly in the logarithm."""
-        depths = [foreground(view, self.splats.means, self.target.near_plane) for view in self.views]
-        scales = [self.request.coarsest ** ((number + 0.5) * GOLDEN % 1) for number in range(len(depths))]
-        found = zip(self.views, depths, scales, strict=True)
-        return [backed(view, depth * (1 / scale - 1)) for view, depth, scale in found if math.isfinite(depth)]
+        """Every view once more, from farther back, where its nearest parts are at a scale down to the ladder's coarsest."""
+        return stepping_back(self.views, self.splats.means, self.target.near_plane, self.request.coarsest)

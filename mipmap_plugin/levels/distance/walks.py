@@ -17,7 +17,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
 from mipmap_plugin.adaptation.target.resize import resize
-from mipmap_plugin.adaptation.views.pixel_size import pixel_size, seen_depth
+from mipmap_plugin.adaptation.views.pixel_size import pixel_size
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -26,23 +26,8 @@ from mipmap_plugin.screen_filters import COMPENSATED
 from mipmap_plugin.splatting.filters import SQUARE_VARIANCE
 from mipmap_plugin.splatting.projection import covariances_of, project
 
-# The part of a view's splats that lies before what counts as its foreground.
-FOREGROUND = 0.1
-
 # World units times the near plane: a splat this near is not in the picture.
 TINY = 1e-6
-
-
-def backed(view: Camera, way: float) -> Camera:
-    """The view from `way` world units farther back."""
-    viewmat = view.viewmat.clone()
-    viewmat[2, 3] += way
-    return replace(view, viewmat=viewmat)
-
-
-def foreground(view: Camera, means: Tensor, near: float) -> float:
-    """The depth of the nearest parts of a view, in world units; infinity where it sees nothing. `means` [N, 3]."""
-    return seen_depth(view, means, near, FOREGROUND)
 
 
 class WalkTruth:

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.curve import decibel
+from mipmap_plugin.adaptation.views.farther import backed, foreground
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance.mixture import Mixture
 from mipmap_plugin.levels.distance.rule import DistanceRule
 from mipmap_plugin.levels.distance.scene import DistanceScene
-from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground, mean_focal
+from mipmap_plugin.levels.distance.walks import WalkTruth, mean_focal
 from mipmap_plugin.levels.yardstick import DRAW, VIEWS
 from mipmap_plugin.limits import derived_seed
 from mipmap_plugin.models.base import SplatModel

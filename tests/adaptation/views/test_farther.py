@@ -1,0 +1,76 @@
+"""Views from farther back than a capture was photographed from."""
+
+import math
+
+import pytest
+import tiny
+import torch
+from levels_by_distance import from_x, with_background
+
+from mipmap_plugin import wrap_model
+from mipmap_plugin.adaptation.views.farther import FARTHER_EVERY, FARTHEST, backed, foreground, some_farther, stepping_back
+from mipmap_plugin.adaptation.views.pixel_size import is_unbounded
+from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.scenes.trajectories import jittered
+
+NEAR = 0.2
+
+
+def test_scenes_with_a_background_are_unbounded_and_objects_are_not():
+    views = tiny.cameras(6)
+    assert is_unbounded(with_background().means, views, 0.01)
+    assert not is_unbounded(tiny.gaussians(200).means, views, 0.01)
+
+
+def test_a_scene_that_no_camera_sees_is_not_unbounded():
+    assert not is_unbounded(torch.cat([torch.zeros(5, 3), torch.full((5, 3), 100.0)]), [from_x(1e6)], 0.01)
+
+
+def test_walking_back_moves_everything_away():
+    view, points = tiny.cameras(1)[0], tiny.gaussians().means
+    before, after = (camera.to_camera(points)[:, 2] for camera in (view, backed(view, 3.0)))
+    torch.testing.assert_close(after, before + 3.0, rtol=1e-4, atol=1e-4)
+
+
+def test_the_foreground_is_what_is_nearest_in_the_picture():
+    view, splats = tiny.cameras(1)[0], with_background()
+    depth = foreground(view, splats.means, 0.2)
+    assert 0.2 < depth < 10
+    assert foreground(backed(view, 5.0), splats.means, 0.2) > depth
+    assert foreground(view, view.center.float()[None] - 100 * view.viewmat[2, :3].float()[None], 0.2) == math.inf
+
+
+def test_views_step_back_by_up_to_the_smallest_scale():
+    """Evenly in the logarithm; the direction and what else a camera is stay, and so does a view that sees nothing."""
+    means, views, blind = with_background().means, tiny.cameras(8), from_x(1e6)
+    farther = stepping_back([*views, blind], means, NEAR, 1 / 4)
+    ways = [float(after.viewmat[2, 3] - before.viewmat[2, 3]) for before, after in zip(views, farther, strict=False)]
+    scales = [depth / (depth + way) for depth, way in zip((foreground(view, means, NEAR) for view in views), ways, strict=True)]
+    assert all(1 / 4 < scale < 1 for scale in scales) and max(scales) > 2 * min(scales)
+    assert all(torch.equal(after.viewmat[:2], before.viewmat[:2]) for before, after in zip(views, farther, strict=False))
+    assert farther[-1] is blind
+
+
+def test_some_generated_views_of_an_unbounded_scene_step_back():
+    means, given = with_background().means, tiny.cameras(8)
+    generated = jittered(given, 9, torch.Generator().manual_seed(0))
+    views, told = some_farther([*given, *generated], given, means, NEAR)
+    moved = [number for number, (before, after) in enumerate(zip([*given, *generated], views, strict=True)) if before is not after]
+    assert moved == [*range(8, 17, FARTHER_EVERY)] and told == ", 3 of these from farther back"
+    depths = [foreground(view, means, NEAR) for view in (generated[0], views[8])]
+    assert FARTHEST < depths[0] / depths[1] < 1
+
+
+def test_no_view_of_an_object_steps_back():
+    given = tiny.cameras(8)
+    generated = jittered(given, 9, torch.Generator().manual_seed(0))
+    assert some_farther([*given, *generated], given, tiny.gaussians(200).means, NEAR) == ([*given, *generated], "")
+
+
+@pytest.mark.parametrize(("scale", "says"), [(1.0, True), (0.5, False)])
+def test_a_file_for_a_viewer_is_adapted_to_views_from_farther_back(scale, says):
+    """At the scale of its training; at another, whoever uses it has stepped back already."""
+    model = VanillaModel.from_gaussians(with_background(), tiny.model(1).trained)
+    base = wrap_model(model, cameras=tiny.cameras(4, width=48, height=36), backend="cpu", threads=1)
+    report = base.adapt(scale, viewer="playcanvas", steps=1, extra_views=3, validation_views=2).report
+    assert ("1 of these from farther back" in report.views) == says
