@@ -12,7 +12,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.optimization.amount import affordable_for
 from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.views.farther import backed, foreground, stepping_back
-from mipmap_plugin.adaptation.views.pixel_size import nearest, pixel_size, seen_pixel_size
+from mipmap_plugin.adaptation.views.pixel_size import is_unbounded, nearest, pixel_size, seen_pixel_size
 from mipmap_plugin.adaptation.views.shown import seeing
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
@@ -99,5 +99,11 @@ class DistanceScene:
         return backed(view, part * way if math.isfinite(way) else 0.0)
 
     def farther(self) -> list[Camera]:
-        """Every view once more, from farther back, where its nearest parts are at a scale down to the ladder's coarsest."""
-        return stepping_back(self.views, self.splats.means, self.target.near_plane, self.request.coarsest)
+        """Every given view once more, from farther back, where its nearest parts are at a scale down to the ladder's coarsest.
+
+        None without cameras, and none of a bounded scene, whose level 0 is shown near by alone.
+        """
+        means, near = self.splats.means, self.target.near_plane
+        if not self.base.cameras or not is_unbounded(means, self.views, near):
+            return []
+        return stepping_back(self.views, means, near, self.request.coarsest)
