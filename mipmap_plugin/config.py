@@ -115,6 +115,12 @@ class AdaptConfig(Settings):
         description="Moving scenes: maximum number of moments at which views are adapted. None: each view at its own, as always with photographs.",
     )
     extra_views: int = Field(default=100, ge=0, description="Number of views that `jittered` adds, or that an orbit has.")
+    farthest: float | None = Field(
+        default=None,
+        gt=0,
+        le=1,
+        description="A third of these step back, until what is nearest is this much smaller. 1: none; None: 0.5 at x1 of unbounded scenes, else 1.",
+    )
 
     closed_form: bool = Field(default=True, description="Start from the closed form instead of from the base.")
     crispness: float = Field(

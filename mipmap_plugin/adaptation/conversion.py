@@ -49,7 +49,7 @@ def conversion(config: AdaptConfig, base: Effects, targets: Collection[Effects],
     steps = min(config.conversion_steps, config.steps)
     if scale <= 1 or not steps or len(targets) > 1 or base in targets:
         return None
-    same = {name: getattr(config, name) for name in ("seed", "views", "extra_views", "most_splats")}
+    same = {name: getattr(config, name) for name in ("seed", "views", "extra_views", "farthest", "most_splats")}
     changes = {"steps": steps, "most_steps": None, "time_budget_s": _half(config), "validation_views": count_of_views(config)}
     return make_config(config.recipe, 1.0, **same).model_copy(update=changes)
 

@@ -88,7 +88,7 @@ class Session:
         with self._looking():
             chosen, note = choose_views(cameras, replace(self.viewpoints, beside=True), self.config)
             means, near = means_at(self.base, chosen[0]), self.drawn.base.near_plane
-            chosen, farther = some_farther(chosen, cameras, means, near) if self.scale == 1 and not self._orbits else (chosen, "")
+            chosen, farther = some_farther(chosen, cameras, means, near, self.scale, self.config.farthest)
             views, validation = split_validation(cameras, chosen, self.viewpoints, self.scale, self.config)
         note += farther + (f", {len(chosen) - len(views)} of them kept for validation" if len(views) < len(chosen) else "")
         validation = telling(validation, means, near)

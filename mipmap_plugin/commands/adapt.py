@@ -54,6 +54,8 @@ class Changes:
 
     views: ViewPolicy | None = None
     """Which views to adapt to; by default those of the recipe."""
+    farthest: float | None = None
+    """For walking back: a third of the extra views step back, until what is nearest is this much smaller, such as 0.5; 1: none."""
     steps: int | None = None
     """Maximum number of optimizer steps."""
     time_budget_s: float | None = None

@@ -13,9 +13,10 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.amount import affordable_for
 from mipmap_plugin.adaptation.target.resize import fitting
+from mipmap_plugin.adaptation.views.farther import some_farther
 from mipmap_plugin.adaptation.views.for_validation import split_validation
 from mipmap_plugin.adaptation.views.policy import choose_views
-from mipmap_plugin.adaptation.views.shown import orbited, seeing, showing
+from mipmap_plugin.adaptation.views.shown import orbited, seeing, telling
 from mipmap_plugin.adaptation.views.viewpoints import Viewpoints, orbit_of
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
@@ -114,10 +115,11 @@ class TiledScene:
         if not cameras and self.config.views != "orbit":
             warn(orbited(self.checkpoint.path, self.viewpoints.orbit))
         chosen, note = choose_views(cameras, self.viewpoints, self.config)
+        means, near = self.base.places[:, :3], self.base_effects.near_plane
+        chosen, farther = some_farther(chosen, cameras, means, near, self.scale, self.config.farthest)
         adapted, validation = split_validation(cameras, chosen, self.viewpoints, self.scale, self.config)
-        note += f", {len(chosen) - len(adapted)} of them kept for validation" if len(adapted) < len(chosen) else ""
-        shown = showing(validation, self.base.places[:, :3], self.base_effects.near_plane)
-        validation = shown if len(shown) > 1 else validation  # others are the same in every state
+        note += farther + (f", {len(chosen) - len(adapted)} of them kept for validation" if len(adapted) < len(chosen) else "")
+        validation = telling(validation, means, near)
         named = [replace(view, name=str(number)) for number, view in enumerate([*adapted, *validation])]
         judged = named[len(adapted) :]
         return Views(named[: len(adapted)], judged[::2], judged[1::2], note)

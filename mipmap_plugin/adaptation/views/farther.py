@@ -45,14 +45,20 @@ def stepping_back(views: Sequence[Camera], means: Tensor, near: float, smallest:
     return found
 
 
-def some_farther(views: Sequence[Camera], given: Sequence[Camera], means: Tensor, near: float) -> tuple[list[Camera], str]:
-    """`views`, with some of those that are not `given` from farther back (`FARTHER_EVERY`) if the scene is unbounded, and what to say of that.
+def some_farther(
+    views: Sequence[Camera], given: Sequence[Camera], means: Tensor, near: float, scale: float, farthest: float | None
+) -> tuple[list[Camera], str]:
+    """`views`, with some of those that are not `given` from farther back (`FARTHER_EVERY`), and what to say of that.
 
-    A bounded scene is only smaller from there, as at a smaller scale. `means`, `near`: as of `stepping_back`.
+    `farthest`: as in the settings. None: at x1, a file for a viewer, in which people step back. For another scale they do so before; and a bounded
+    scene is only smaller from there, as at a smaller scale. `means`, `near`: as of `stepping_back`.
     """
     known = set(given)
     some = [view for view in views if view not in known][::FARTHER_EVERY]
-    if not some or not is_unbounded(means, given, near):
+    if farthest is None:
+        around = scale == 1 and len(some) > 0 and any(view in known for view in views)
+        farthest = FARTHEST if around and is_unbounded(means, given, near) else 1.0
+    if not some or farthest == 1:
         return list(views), ""
-    farther = dict(zip(some, stepping_back(some, means, near, FARTHEST), strict=True))
+    farther = dict(zip(some, stepping_back(some, means, near, farthest), strict=True))
     return [farther.get(view, view) for view in views], f", {len(farther)} of these from farther back"

@@ -54,17 +54,37 @@ def test_views_step_back_by_up_to_the_smallest_scale():
 def test_some_generated_views_of_an_unbounded_scene_step_back():
     means, given = with_background().means, tiny.cameras(8)
     generated = jittered(given, 9, torch.Generator().manual_seed(0))
-    views, told = some_farther([*given, *generated], given, means, NEAR)
+    views, told = some_farther([*given, *generated], given, means, NEAR, 1.0, None)
     moved = [number for number, (before, after) in enumerate(zip([*given, *generated], views, strict=True)) if before is not after]
     assert moved == [*range(8, 17, FARTHER_EVERY)] and told == ", 3 of these from farther back"
     depths = [foreground(view, means, NEAR) for view in (generated[0], views[8])]
     assert FARTHEST < depths[0] / depths[1] < 1
 
 
-def test_no_view_of_an_object_steps_back():
+@pytest.mark.parametrize(
+    ("means", "scale", "farthest", "moved"),
+    [
+        (tiny.gaussians(200).means, 1.0, None, 0),
+        (tiny.gaussians(200).means, 1.0, 0.7, 3),
+        (with_background().means, 1.0, 1.0, 0),
+        (with_background().means, 0.5, None, 0),
+        (with_background().means, 0.5, 0.7, 3),
+    ],
+)
+def test_views_of_objects_and_of_zoom_outs_step_back_only_where_the_settings_say_so(means, scale, farthest, moved):
     given = tiny.cameras(8)
-    generated = jittered(given, 9, torch.Generator().manual_seed(0))
-    assert some_farther([*given, *generated], given, tiny.gaussians(200).means, NEAR) == ([*given, *generated], "")
+    views = [*given, *jittered(given, 9, torch.Generator().manual_seed(0))]
+    found, told = some_farther(views, given, means, NEAR, scale, farthest)
+    assert sum(before is not after for before, after in zip(views, found, strict=True)) == moved
+    assert told == (f", {moved} of these from farther back" if moved else "")
+
+
+def test_an_orbit_steps_back_only_where_the_settings_say_so():
+    """Its views are all generated."""
+    means, orbit = with_background().means, tiny.cameras(6)
+    assert some_farther(orbit, [], means, NEAR, 1.0, None) == (orbit, "")
+    found, told = some_farther(orbit, [], means, NEAR, 1.0, 0.5)
+    assert sum(before is not after for before, after in zip(orbit, found, strict=True)) == 2 and told == ", 2 of these from farther back"
 
 
 @pytest.mark.parametrize(("scale", "says"), [(1.0, True), (0.5, False)])
