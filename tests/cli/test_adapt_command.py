@@ -126,12 +126,12 @@ def test_files_and_pages_are_told_by_their_paths_from_here(run):
 
 def test_adapt_hands_its_options_on(run, model_folder, tmp_path):
     options = ["--recipe", "paper", "--seed", "7", "--resize", "area", "--upsampler", "lanczos", "--background", "white", "--time-budget-s", "60",
-               "--farthest", "0.7"]  # fmt: skip
+               "--farthest", "1"]  # fmt: skip
     code, out, _ = run("adapt", model_folder, "--scale", "1/2", "--output", tmp_path / "a.ply", "--json", *options, *QUICK)
     assert code == 0
     settings = json.loads(out)[0]["settings"]
     assert {name: settings[name] for name in ("recipe", "seed", "resize", "upsampler", "time_budget_s", "steps", "views", "farthest")} == {
-        "recipe": "paper", "seed": 7, "resize": "area", "upsampler": "lanczos", "time_budget_s": 60, "steps": 2, "views": "given", "farthest": 0.7,
+        "recipe": "paper", "seed": 7, "resize": "area", "upsampler": "lanczos", "time_budget_s": 60, "steps": 2, "views": "given", "farthest": 1,
     }  # fmt: skip
 
 

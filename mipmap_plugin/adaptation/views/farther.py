@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.views.pixel_size import is_unbounded, seen_depth
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.scenes.photographed import GOLDEN
 
 # The part of a view's splats that lies before what counts as its foreground.
@@ -51,14 +52,16 @@ def some_farther(
     """`views`, with some of those that are not `given` from farther back (`FARTHER_EVERY`), and what to say of that.
 
     `farthest`: as in the settings. None: at x1, a file for a viewer, in which people step back. For another scale they do so before; and a bounded
-    scene is only smaller from there, as at a smaller scale. `means`, `near`: as of `stepping_back`.
+    scene is only smaller from there, as at a smaller scale. `means`, `near`: as of `stepping_back`. Raises SettingsError where none could step back.
     """
     known = set(given)
     some = [view for view in views if view not in known][::FARTHER_EVERY]
     if farthest is None:
-        around = scale == 1 and len(some) > 0 and any(view in known for view in views)
-        farthest = FARTHEST if around and is_unbounded(means, given, near) else 1.0
-    if not some or farthest == 1:
+        around_given = scale == 1 and len(some) > 0 and any(view in known for view in views)
+        farthest = FARTHEST if around_given and is_unbounded(means, given, near) else 1.0
+    if farthest == 1:
         return list(views), ""
+    if not some:
+        raise SettingsError("farthest: all views are given ones, and only generated ones step back; take the views jittered, or leave farthest out")
     farther = dict(zip(some, stepping_back(some, means, near, farthest), strict=True))
     return [farther.get(view, view) for view in views], f", {len(farther)} of these from farther back"

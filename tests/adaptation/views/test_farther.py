@@ -10,6 +10,7 @@ from levels_by_distance import from_x, with_background
 from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation.views.farther import FARTHER_EVERY, FARTHEST, backed, foreground, some_farther, stepping_back
 from mipmap_plugin.adaptation.views.pixel_size import is_unbounded
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes.trajectories import jittered
 
@@ -94,3 +95,10 @@ def test_a_file_for_a_viewer_is_adapted_to_views_from_farther_back(scale, says):
     base = wrap_model(model, cameras=tiny.cameras(4, width=48, height=36), backend="cpu", threads=1)
     report = base.adapt(scale, viewer="playcanvas", steps=1, extra_views=3, validation_views=2).report
     assert ("1 of these from farther back" in report.views) == says
+
+
+def test_where_no_view_could_step_back_farthest_is_refused():
+    base = wrap_model(VanillaModel.from_gaussians(with_background(), tiny.model(1).trained), cameras=tiny.cameras(4), backend="cpu", threads=1)
+    with pytest.raises(SettingsError, match="farthest: all views are given ones"):
+        base.adapt(0.5, farthest=0.5, views="train", steps=1)
+    assert base.adapt(0.5, farthest=1.0, views="train", steps=1).report.views == "the 4 train views"
