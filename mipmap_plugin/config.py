@@ -119,7 +119,7 @@ class AdaptConfig(Settings):
         default=None,
         gt=0,
         le=1,
-        description="A third of these step back, until what is nearest is this much smaller. 1: none; None: 0.5 at x1 of unbounded scenes, else 1.",
+        description="A third of the extra views step back, until what is nearest is this much smaller. None: 0.5 at x1 of unbounded scenes, else 1.",
     )
 
     closed_form: bool = Field(default=True, description="Start from the closed form instead of from the base.")

@@ -146,7 +146,8 @@ def test_what_takes_long_is_announced(small_chunks, monkeypatch):
     for module in ("ladder", "level"):
         monkeypatch.setattr(f"mipmap_plugin.levels.distance.{module}.announced", lambda what: (told.append(what), nullcontext())[1])
     wrapped().levels("classic", by="distance", coarsest=1 / 2, ratio=2.0, **BRIEF)
-    assert told == ["cutting the scene into chunks", "level 1: choosing views", "level 1: merging", "level 1: validation", "measuring the levels"]
+    first = ["cutting the scene into chunks", "level 0: choosing views"]
+    assert told == [*first, "level 1: choosing views", "level 1: merging", "level 1: validation", "measuring the levels"]
 
 
 def test_a_level_that_is_worse_than_the_finer_one_says_so(small_chunks, monkeypatch):

@@ -47,7 +47,8 @@ def make_levels_by_distance(base: FrozenBase, request: LadderRequest, resume: Pa
         scene = scene_of(base, request, band)
         store = LevelStore(resume, base, request)
     # Adapted to the views of the training alone, level 0 would be worse than the base wherever nobody trained: its far parts are in every level.
-    cameras = [*base.cameras, *farther] if (farther := scene.farther()) else None
+    with announced("level 0: choosing views"):
+        cameras = [*base.cameras, *farther] if (farther := scene.farther()) else None
     first = store.level("level_0", lambda state: base.adapt(1.0, cameras=cameras, resume=state, **request.for_first(base, band)))
     with threads.limited_for(scene.backend, base.threads):
         levels = [first]

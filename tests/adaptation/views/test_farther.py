@@ -9,22 +9,11 @@ from levels_by_distance import from_x, with_background
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation.views.farther import FARTHER_EVERY, FARTHEST, backed, foreground, some_farther, stepping_back
-from mipmap_plugin.adaptation.views.pixel_size import is_unbounded
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes.trajectories import jittered
 
 NEAR = 0.2
-
-
-def test_scenes_with_a_background_are_unbounded_and_objects_are_not():
-    views = tiny.cameras(6)
-    assert is_unbounded(with_background().means, views, 0.01)
-    assert not is_unbounded(tiny.gaussians(200).means, views, 0.01)
-
-
-def test_a_scene_that_no_camera_sees_is_not_unbounded():
-    assert not is_unbounded(torch.cat([torch.zeros(5, 3), torch.full((5, 3), 100.0)]), [from_x(1e6)], 0.01)
 
 
 def test_walking_back_moves_everything_away():
@@ -50,6 +39,16 @@ def test_views_step_back_by_up_to_the_smallest_scale():
     assert all(1 / 4 < scale < 1 for scale in scales) and max(scales) > 2 * min(scales)
     assert all(torch.equal(after.viewmat[:2], before.viewmat[:2]) for before, after in zip(views, farther, strict=False))
     assert farther[-1] is blind
+
+
+def test_some_of_many_splats_tell_how_far_views_step_back(monkeypatch):
+    means, views = with_background(near=3000, far=2000).means, tiny.cameras(8)
+    whole = stepping_back(views, means, NEAR, 1 / 4)
+    monkeypatch.setattr("mipmap_plugin.adaptation.views.farther.TELLING", 500)
+    assert not torch.equal(stepping_back(views[:1], means, NEAR, 1 / 4)[0].viewmat, whole[0].viewmat)
+    for view, one, other in zip(views, whole, stepping_back(views, means, NEAR, 1 / 4), strict=True):
+        ways = [float((each.viewmat - view.viewmat)[2, 3]) for each in (one, other)]
+        assert ways[1] == pytest.approx(ways[0], rel=0.1)
 
 
 def test_some_generated_views_of_an_unbounded_scene_step_back():

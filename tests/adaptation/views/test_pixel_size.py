@@ -7,9 +7,19 @@ from dataclasses import replace
 import pytest
 import tiny
 import torch
+from levels_by_distance import from_x, with_background
 
 from mipmap_plugin.adaptation.views import pixel_size as module
-from mipmap_plugin.adaptation.views.pixel_size import LEAST_VIEWS, MOST_VIEWS, SEEN, enough_views, mean_pixel_size, pixel_size, views_for
+from mipmap_plugin.adaptation.views.pixel_size import (
+    LEAST_VIEWS,
+    MOST_VIEWS,
+    SEEN,
+    enough_views,
+    is_unbounded,
+    mean_pixel_size,
+    pixel_size,
+    views_for,
+)
 from mipmap_plugin.backends.cpu import finest_pixels
 from mipmap_plugin.camera import Camera
 
@@ -110,3 +120,13 @@ def test_the_closest_view_of_what_few_views_show_is_looked_for_among_all():
     """Of 200 views, of which every fifth is looked at, two show the splat, and the closer is not among these."""
     views = [VIEW, CLOSER, *[AWAY] * 198]
     torch.testing.assert_close(pixel_size(torch.tensor([[0.0, 0.0, 4.0]]), views, 12), torch.tensor([2.0]) / FOCAL)
+
+
+def test_scenes_with_a_background_are_unbounded_and_objects_are_not():
+    views = tiny.cameras(6)
+    assert is_unbounded(with_background().means, views, 0.01)
+    assert not is_unbounded(tiny.gaussians(200).means, views, 0.01)
+
+
+def test_a_scene_that_no_camera_sees_is_not_unbounded():
+    assert not is_unbounded(torch.cat([torch.zeros(5, 3), torch.full((5, 3), 100.0)]), [from_x(1e6)], 0.01)
