@@ -24,7 +24,7 @@ from mipmap_plugin.adaptation.target.photographs import Photographs, scene_of
 from mipmap_plugin.adaptation.target.upsamplers import network_input
 from mipmap_plugin.adaptation.views.placing import placed
 from mipmap_plugin.adaptation.views.policy import choose_views
-from mipmap_plugin.adaptation.views.shown import refuse_blind, refuse_large
+from mipmap_plugin.adaptation.views.refusals import refuse_blind, refuse_large
 from mipmap_plugin.adaptation.views.viewpoints import ClearViews, Viewpoints, orbit_of
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Backend, Needs, Rendered

@@ -22,7 +22,8 @@ from mipmap_plugin.adaptation.session import Session
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.views.for_validation import count_of_views
-from mipmap_plugin.adaptation.views.shown import orbited, seeing
+from mipmap_plugin.adaptation.views.remarks import orbited
+from mipmap_plugin.adaptation.views.shown import seeing
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import ONE_PIXEL, Camera
 from mipmap_plugin.config import AdaptConfig

@@ -38,7 +38,9 @@ from mipmap_plugin.adaptation.views.farther import some_farther
 from mipmap_plugin.adaptation.views.for_validation import WINDOW, split_validation
 from mipmap_plugin.adaptation.views.moments import at_their_moments, evaluate_moments
 from mipmap_plugin.adaptation.views.policy import choose_views, over_band
-from mipmap_plugin.adaptation.views.shown import hints, refuse_blind, remarks, telling, too_far_out
+from mipmap_plugin.adaptation.views.refusals import refuse_blind
+from mipmap_plugin.adaptation.views.remarks import hints, remarks, too_far_out
+from mipmap_plugin.adaptation.views.shown import telling
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.adaptation.worse import better_as_trained, worse_viewers, worse_views
 from mipmap_plugin.backends.base import Calls

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB
 from mipmap_plugin.adaptation.views.pixel_size import seen_depth
-from mipmap_plugin.adaptation.views.shown import EACH_LENS, SAMPLES, focal_length
+from mipmap_plugin.adaptation.views.remarks import EACH_LENS, focal_length
+from mipmap_plugin.adaptation.views.shown import SAMPLES
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import some_of

@@ -79,7 +79,7 @@ def _differences(wrapped: Wrapped) -> str:
 
 def _facts(checkpoint: Path, wrapped: Wrapped, given: Path | None, *, whole: bool) -> dict[str, Any]:
     """What is known of a loaded model without a picture, by name. `given`: where its cameras lie; `whole`: with the effects that are off."""
-    from mipmap_plugin.adaptation.views.shown import hints, remarks
+    from mipmap_plugin.adaptation.views.remarks import hints, remarks
     from mipmap_plugin.effects import explain
     from mipmap_plugin.models.base import effects_of
     from mipmap_plugin.models.health import examine, holds_splats

@@ -15,7 +15,8 @@ import torch
 
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report
 from mipmap_plugin.adaptation.target.detail import unused_upsampler
-from mipmap_plugin.adaptation.views.shown import hints, refuse_blind, remarks, too_far_out
+from mipmap_plugin.adaptation.views.refusals import refuse_blind
+from mipmap_plugin.adaptation.views.remarks import hints, remarks, too_far_out
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.camera import Camera

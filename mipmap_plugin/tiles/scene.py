@@ -16,7 +16,8 @@ from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.views.farther import some_farther
 from mipmap_plugin.adaptation.views.for_validation import split_validation
 from mipmap_plugin.adaptation.views.policy import choose_views
-from mipmap_plugin.adaptation.views.shown import orbited, seeing, telling
+from mipmap_plugin.adaptation.views.remarks import orbited
+from mipmap_plugin.adaptation.views.shown import seeing, telling
 from mipmap_plugin.adaptation.views.viewpoints import Viewpoints, orbit_of
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs

@@ -23,7 +23,8 @@ from mipmap_plugin.adaptation.start.closed_form import closed_form
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
 from mipmap_plugin.adaptation.views.pixel_size import mean_pixel_size
-from mipmap_plugin.adaptation.views.shown import remarks, showing
+from mipmap_plugin.adaptation.views.remarks import remarks
+from mipmap_plugin.adaptation.views.shown import showing
 from mipmap_plugin.backends import gsplat, inria
 from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.backends.cpu import nearest_along

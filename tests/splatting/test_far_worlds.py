@@ -9,7 +9,7 @@ from tiny import cameras
 
 from mipmap_plugin.adaptation.optimization.density import ScreenGradients
 from mipmap_plugin.adaptation.views.pixel_size import pixel_size
-from mipmap_plugin.adaptation.views.shown import too_far_out
+from mipmap_plugin.adaptation.views.remarks import too_far_out
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.models.mip import filter_3d_of
 from mipmap_plugin.models.vanilla import VanillaModel

@@ -209,7 +209,7 @@ def test_validation_views_that_show_nothing_do_not_count(job, monkeypatch):
 
 
 def test_what_is_wrong_with_views_is_told(job, monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.adaptation.views.shown.UNLIKE", 0.5)
+    monkeypatch.setattr("mipmap_plugin.adaptation.views.remarks.UNLIKE", 0.5)
     with pytest.warns(UserWarning, match="adapt with the cameras of each lens on their own"):
         adapt_in_tiles(replace(job, settings=job.settings | {"steps": 0}), 2)
 

@@ -10,7 +10,7 @@ import torch
 from brief_runs import is_finite, shrunk
 
 from mipmap_plugin.adaptation import worse
-from mipmap_plugin.adaptation.views.shown import far_apart, remarks
+from mipmap_plugin.adaptation.views.remarks import far_apart, remarks
 from mipmap_plugin.adaptation.worse import worse_views
 from mipmap_plugin.camera import Camera, viewmat_of
 from mipmap_plugin.errors import SettingsError

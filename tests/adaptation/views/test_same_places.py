@@ -12,7 +12,7 @@ import torch
 from torch_checkpoints import gsplat_folder, splatfacto_folder, splats
 
 from mipmap_plugin import wrap_model
-from mipmap_plugin.adaptation.views.shown import orbited
+from mipmap_plugin.adaptation.views.remarks import orbited
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError, SettingsError
 from mipmap_plugin.models.adapted_scale import adapted_orbit
