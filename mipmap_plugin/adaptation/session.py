@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from mipmap_plugin.adaptation.adapted import Adapted
@@ -34,13 +35,12 @@ from mipmap_plugin.adaptation.target.detail import DetailLoss, unused_upsampler
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views.farther import some_farther
-from mipmap_plugin.adaptation.views.for_validation import WINDOW, split_validation
+from mipmap_plugin.adaptation.views.for_validation import WINDOW
 from mipmap_plugin.adaptation.views.moments import at_their_moments, evaluate_moments
-from mipmap_plugin.adaptation.views.policy import choose_views, over_band
+from mipmap_plugin.adaptation.views.of_run import views_of_run
+from mipmap_plugin.adaptation.views.policy import over_band
 from mipmap_plugin.adaptation.views.refusals import refuse_blind
 from mipmap_plugin.adaptation.views.remarks import hints, remarks, too_far_out
-from mipmap_plugin.adaptation.views.shown import telling
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.adaptation.worse import better_as_trained, worse_viewers, worse_views
 from mipmap_plugin.backends.base import Calls
@@ -87,13 +87,9 @@ class Session:
 
     def _choose_views(self, cameras: list[Camera]) -> tuple[list[Camera], list[Camera], str]:
         """The views to adapt to, the views for validation, and a description of the former."""
+        means, near = partial(means_at, self.base), self.drawn.base.near_plane
         with self._looking():
-            chosen, note = choose_views(cameras, replace(self.viewpoints, beside=True), self.config)
-            means, near = means_at(self.base, chosen[0]), self.drawn.base.near_plane
-            chosen, farther = some_farther(chosen, cameras, means, near, self.scale, self.config.farthest)
-            views, validation = split_validation(cameras, chosen, self.viewpoints, self.scale, self.config)
-        note += farther + (f", {len(chosen) - len(views)} of them kept for validation" if len(views) < len(chosen) else "")
-        validation = telling(validation, means, near)
+            views, validation, note = views_of_run(cameras, self.viewpoints, means, near, self.scale, self.config)
         if self.base.traits.moves:
             moments = None if self._has_photographs else affordable_moments(self.config, self.base)  # a photograph shows no moment but its own
             views, validation, times = at_their_moments(views, validation, moments, self.config.seed)

@@ -13,11 +13,9 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.amount import affordable_for
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views.farther import some_farther
-from mipmap_plugin.adaptation.views.for_validation import split_validation
-from mipmap_plugin.adaptation.views.policy import choose_views
+from mipmap_plugin.adaptation.views.of_run import views_of_run
 from mipmap_plugin.adaptation.views.remarks import orbited
-from mipmap_plugin.adaptation.views.shown import seeing, telling
+from mipmap_plugin.adaptation.views.shown import seeing
 from mipmap_plugin.adaptation.views.viewpoints import Viewpoints, orbit_of
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
@@ -115,12 +113,8 @@ class TiledScene:
         cameras = seeing(self.wrapped.cameras, self.base.places[:, :3], self.target.near_plane)
         if not cameras and self.config.views != "orbit":
             warn(orbited(self.checkpoint.path, self.viewpoints.orbit))
-        chosen, note = choose_views(cameras, self.viewpoints, self.config)
-        means, near = self.base.places[:, :3], self.base_effects.near_plane
-        chosen, farther = some_farther(chosen, cameras, means, near, self.scale, self.config.farthest)
-        adapted, validation = split_validation(cameras, chosen, self.viewpoints, self.scale, self.config)
-        note += farther + (f", {len(chosen) - len(adapted)} of them kept for validation" if len(adapted) < len(chosen) else "")
-        validation = telling(validation, means, near)
+        places, near = self.base.places[:, :3], self.base_effects.near_plane
+        adapted, validation, note = views_of_run(cameras, self.viewpoints, lambda _: places, near, self.scale, self.config)
         named = [replace(view, name=str(number)) for number, view in enumerate([*adapted, *validation])]
         judged = named[len(adapted) :]
         return Views(named[: len(adapted)], judged[::2], judged[1::2], note)

@@ -199,7 +199,7 @@ def test_validation_views_that_show_nothing_do_not_count(job, monkeypatch):
     around = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
     views = tiny.cameras(5, seed=3, width=20, height=16)
     away = [replace(view, viewmat=around @ view.viewmat) for view in views[:2]]
-    monkeypatch.setattr("mipmap_plugin.tiles.scene.split_validation", lambda cameras, chosen, *_: (chosen, [*away, *views[2:]]))
+    monkeypatch.setattr("mipmap_plugin.adaptation.views.of_run.split_validation", lambda cameras, chosen, *_: (chosen, [*away, *views[2:]]))
     folder = work_folder(job.target)
     folder.mkdir()
     make_cut(job.base.checkpoint, 2, folder)

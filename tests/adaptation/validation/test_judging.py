@@ -9,7 +9,6 @@ import tiny
 import torch
 from equal_models import SCALE
 
-from mipmap_plugin.adaptation import session
 from mipmap_plugin.adaptation.curve import INVISIBLE_ERROR
 from mipmap_plugin.adaptation.optimization.validation import TIE_DB, VISIBLE_ERROR, Validation
 from mipmap_plugin.adaptation.views.for_validation import VALIDATION_EVERY, WINDOW, split_validation
@@ -100,7 +99,7 @@ def test_a_window_has_whole_blocks_where_its_view_has(pixels):
 
 def test_a_single_view_both_steers_and_chooses(monkeypatch):
     """Where only one view sees a scene clearly, what is no better than the base in it is still not returned."""
-    monkeypatch.setattr(session, "split_validation", lambda cameras, views, *others: (list(views), tiny.cameras(1)))
+    monkeypatch.setattr("mipmap_plugin.adaptation.views.of_run.split_validation", lambda cameras, views, *others: (list(views), tiny.cameras(1)))
     report = tiny.wrapped(tiny.gaussians()).adapt(SCALE, cameras=tiny.cameras(4), steps=1).report
     assert "the base as it is" in report.validation and "not validated" not in report.returned
 

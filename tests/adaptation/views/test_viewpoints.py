@@ -12,7 +12,6 @@ import torch
 from lone_capture import capture
 
 from mipmap_plugin import wrap_model
-from mipmap_plugin.adaptation import session
 from mipmap_plugin.adaptation.optimization.amount import DRAWS_A_SECOND, FOR_LOOKS, looks_in_budget
 from mipmap_plugin.adaptation.views.for_validation import split_validation
 from mipmap_plugin.adaptation.views.policy import choose_views
@@ -174,7 +173,8 @@ def test_views_beside_the_middle_are_adapted_to_and_no_others(monkeypatch):
     lone, validated = lone_capture(), []
     middle = torch.tensor(lone.viewpoints.orbit.center, dtype=torch.float64)
     monkeypatch.setattr(ClearViews, "__call__", lambda _, views: [view for view in views if on_one_side(view)])
-    monkeypatch.setattr(session, "split_validation", lambda *given: validated.append(split_validation(*given)) or validated[-1])
+    split = "mipmap_plugin.adaptation.views.of_run.split_validation"
+    monkeypatch.setattr(split, lambda *given: validated.append(split_validation(*given)) or validated[-1])
     lone.adapt(1 / 4, recipe="instant", extra_views=20)
     [(adapted, validation)] = validated
     turns = [[abs(turned(view, middle)) for view in views] for views in (adapted, validation, lone.views())]
