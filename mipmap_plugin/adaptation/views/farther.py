@@ -18,7 +18,7 @@ FOREGROUND = 0.1
 
 # One in so many generated views steps back, until its foreground is at most this much smaller. A file for a viewer that is adapted to views from
 # near the photographs' places alone may be worse than its base elsewhere: one of a phone's capture in PlayCanvas by 2.2 dB where the foreground
-# is half as large, and with these views better by 0.6. Near the photographs' places they change -0.2 to 0.6 dB; from farther back they would cost.
+# is half as large, and with these views better by 0.6. Near the photographs' places they change -0.3 to 0.6 dB; from farther back they would cost.
 FARTHER_EVERY, FARTHEST = 3, 0.5
 
 # So many splats tell how far away a view's foreground is: a thousand views of a million splats would take half a minute.
