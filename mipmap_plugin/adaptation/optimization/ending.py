@@ -15,6 +15,7 @@ class End(Enum):
     TIME = "time budget"
     START = "time budget, all of which the start took"
     CHOICE = "time budget, all of which the start and the choice of a state take"
+    ALIKE = "start, which looks like the pseudo truth"
     TARGET = "target"
     KNEE = "knee"
     OBSERVER = "its observer"
@@ -32,6 +33,8 @@ class End(Enum):
             case End.CHOICE:
                 start = "the start" if share == 1 else "the conversion, the start"
                 return f"{budget}, not enough for a step beside {start} and the choice of a state"
+            case End.ALIKE:
+                return "the start, which differs from the pseudo truth by less than a display shows"
             case End.TARGET:
                 return f"target of {config.target_db:g} dB against the pseudo truth"
             case End.KNEE:

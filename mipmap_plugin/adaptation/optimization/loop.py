@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.curve import INVISIBLE_ERROR, decibel
 from mipmap_plugin.adaptation.optimization import density
 from mipmap_plugin.adaptation.optimization.activation import Activation, WithGradients
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
@@ -22,6 +23,7 @@ from mipmap_plugin.adaptation.optimization.interrupt import interruptible
 from mipmap_plugin.adaptation.optimization.losses import compare
 from mipmap_plugin.adaptation.optimization.optimizer import set_rates
 from mipmap_plugin.adaptation.optimization.run import Run, Task
+from mipmap_plugin.adaptation.optimization.validation import TIE_DB
 from mipmap_plugin.adaptation.parallel import large_for_torch, max_threads, together, views_at_once
 from mipmap_plugin.adaptation.views.schedule import ViewSchedule
 from mipmap_plugin.camera import Camera
@@ -45,7 +47,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     order = ViewSchedule(task.views, config)
     bar = StepsBar.of(run, task, config, order)
     with bar, ticking(bar), interruptible() as interrupted:
-        reason = End.OBSERVER if observe(run) else run.reason_to_stop(config)
+        reason = End.OBSERVER if observe(run) else run.reason_to_stop(config) or _nothing_to_gain(run, task, config)
         while reason is None and run.step < config.steps:
             with run.watch:
                 views = order(run.step, run.progress(config))
@@ -155,6 +157,12 @@ def _make_truths(run: Run, task: Task, config: AdaptConfig, order: ViewSchedule,
         run.costs.prepare(new, prepare)
     else:
         list(side_by_side(lambda view: run.costs.truth(view, task.truth), new, at_once))
+
+
+def _nothing_to_gain(run: Run, task: Task, config: AdaptConfig) -> End | None:
+    """Why there is no first step, where no view that steers the run shows a difference that steps could make smaller."""
+    alike = run.step == 0 and run.curve[0].validation_db > decibel(INVISIBLE_ERROR) - TIE_DB  # which is the most
+    return End.ALIKE if alike and task.scale <= 1 and config.returns == "best" else None  # a zoom-in is compared with the base, not with its truth
 
 
 def _no_time_for_truths(run: Run, config: AdaptConfig, order: ViewSchedule) -> End | None:

@@ -72,7 +72,7 @@ def test_two_views_in_one_step_count_as_two_views_each_with_its_own_gradient():
         student.parameters()["means"].fill_(1.0)
         for each in pull.values():
             each.abs_()
-    config = AdaptConfig(steps=1, views_per_step=2, densify_gradient=1.0, rates=LearningRates())
+    config = AdaptConfig(steps=1, views_per_step=2, densify_gradient=1.0, rates=LearningRates(), returns="last")
     black = lambda view: torch.zeros(1, 1, 1)  # noqa: E731
     validation = Validation(views, views, 1.0, black, [lambda gaussians, camera: torch.zeros(1, 1, 1)], "area")
     task = Task(views, 1.0, black, [render], white_background=False, validation=validation)

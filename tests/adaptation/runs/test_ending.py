@@ -1,12 +1,14 @@
 """Adapting ends when the curve says so, and says why; whoever watches sees the model while the clock stands."""
 
 import time
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 import tiny
 import torch
 
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
 
 pytestmark = pytest.mark.usefixtures("few_views")
@@ -29,6 +31,17 @@ def test_the_target_ends_the_run_at_the_first_check_that_reaches_it():
 
 def test_a_target_out_of_reach_leaves_the_steps_to_end_it():
     assert wrapped().adapt(1 / 4, target_db=200, **STEPS).report.ended_by == "12 steps"
+
+
+@pytest.mark.parametrize(("settings", "scale", "steps"), [({}, 1 / 4, 0), ({"returns": "last"}, 1 / 4, 12), ({}, 2, 12)])
+def test_no_step_is_taken_where_nobody_could_see_what_it_gains(settings, scale, steps):
+    """A splat as large as a sky is the same at every scale. A zoom-in is compared with the base, which does not tell what its truth has."""
+    sky = replace(tiny.gaussians(1, degree=0), scales=torch.full((1, 3), 100.0), opacities=torch.ones(1))
+    base = wrap_model(VanillaModel.from_gaussians(sky, tiny.model(1).trained), cameras=tiny.cameras(4), backend="reference")
+    report = base.adapt(scale, **STEPS, **settings).report
+    assert report.curve[0].validation_db == pytest.approx(54.15, abs=0.01) and report.curve[-1].step == steps
+    alike = "the start, which differs from the pseudo truth by less than a display shows"
+    assert report.ended_by == (f"{steps} steps" if steps else alike)
 
 
 def test_the_observer_sees_every_step_and_the_model_of_that_step():
