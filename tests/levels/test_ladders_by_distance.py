@@ -12,6 +12,7 @@ from pages_read import record_of
 
 from mipmap_plugin import cli, load_model, wrap_model
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
+from mipmap_plugin.adaptation.optimization.steering import Steering
 from mipmap_plugin.adaptation.optimization.validation import Validation
 from mipmap_plugin.adaptation.views.farther import foreground
 from mipmap_plugin.commands.levels import print_summary
@@ -155,6 +156,15 @@ def test_a_level_that_is_worse_than_the_finer_one_says_so(small_chunks, monkeypa
     with pytest.warns(UserWarning, match=r"level_1: pictures in which it is shown have .* dB, and 99\.0 with the finer level in its place"):
         report = wrapped().levels("classic", by="distance", coarsest=1 / 2, ratio=2.0, **BRIEF).contents.levels[1].report
     assert report.validation[AS_FINER] == 99.0 and any(note.startswith("level_1:") for note in report.notes)
+
+
+def test_a_level_whose_steps_gain_nothing_at_rates_that_do_no_harm_ends(small_chunks, monkeypatch):
+    """Where a file of its own would go on at full rates, as level 0 does: there is little to lose."""
+    monkeypatch.setattr(Steering, "is_stuck", lambda self, progress, config: progress >= 0.5)
+    ladder = wrapped().levels("playcanvas", by="distance", coarsest=1 / 2, ratio=2.0, **BRIEF | {"steps": 4})
+    first, level = (each.report for each in ladder.contents.levels)
+    assert first.ended_by == "4 steps" and level.ended_by == "2 steps, which gained nothing at rates that do no harm"
+    assert level.curve[-1].step == 2
 
 
 def test_a_level_at_the_end_that_is_the_finer_one_again_is_left_out(tmp_path, small_chunks, monkeypatch, capsys):

@@ -52,7 +52,8 @@ def check(run: Run, task: Task, config: AdaptConfig) -> None:
         run.gradients = None if run.gradients is None else ScreenGradients.of(run.student.parameters()["means"], config)
     else:
         steering.update_best(quality.visible, run.step, run.student, run.rows_changed, factor)
-    steering.dare(run.progress(config), config)
+    if task.dares and steering.is_stuck(run.progress(config), config):
+        steering.dare()
     mean = float(run.square_error) / max(1, steps)  # this waits for a GPU, so that the clock counts its work
     best_db = next((point.validation_db for point in reversed(run.curve) if point.step == steering.best_step), quality.psnr)
     point = CurvePoint(

@@ -16,6 +16,7 @@ class End(Enum):
     START = "time budget, all of which the start took"
     CHOICE = "time budget, all of which the start and the choice of a state take"
     ALIKE = "start, which looks like the pseudo truth"
+    STUCK = "no gain"
     TARGET = "target"
     KNEE = "knee"
     OBSERVER = "its observer"
@@ -35,6 +36,8 @@ class End(Enum):
                 return f"{budget}, not enough for a step beside {start} and the choice of a state"
             case End.ALIKE:
                 return "the start, which differs from the pseudo truth by less than a display shows"
+            case End.STUCK:
+                return f"{plural(steps, 'step')}, which gained nothing at rates that do no harm"
             case End.TARGET:
                 return f"target of {config.target_db:g} dB against the pseudo truth"
             case End.KNEE:

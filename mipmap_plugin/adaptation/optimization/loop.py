@@ -57,7 +57,8 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
                 if is_checked(run.step, config):
                     check(run, task, config)
             bar.show(run, task, config)
-            reason = End.OBSERVER if observe(run) else run.reason_to_stop(config) or _no_time_for_truths(run, config, order)
+            reason = End.OBSERVER if observe(run) else run.reason_to_stop(config) or _nothing_to_gain(run, task, config)
+            reason = reason or _no_time_for_truths(run, config, order)
             if interrupted():
                 on_interrupt(run)
         with run.watch:
@@ -160,7 +161,9 @@ def _make_truths(run: Run, task: Task, config: AdaptConfig, order: ViewSchedule,
 
 
 def _nothing_to_gain(run: Run, task: Task, config: AdaptConfig) -> End | None:
-    """Why there is no first step, where no view that steers the run shows a difference that steps could make smaller."""
+    """Why there is no further step, where none would gain anything that can be seen."""
+    if not task.dares and run.steering.is_stuck(run.progress(config), config):
+        return End.STUCK
     alike = run.step == 0 and run.curve[0].validation_db > decibel(INVISIBLE_ERROR) - TIE_DB  # which is the most
     return End.ALIKE if alike and task.scale <= 1 and config.returns == "best" else None  # a zoom-in is compared with the base, not with its truth
 

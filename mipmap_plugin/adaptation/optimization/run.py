@@ -52,6 +52,7 @@ class Task:
     follow: Following = field(default_factory=Following)  # called before each step
     color_limits: tuple[float, float] | None = None  # of the coefficients of SH degree 0, which a step leaves within them
     part: str = ""  # of a scene, such as a tile or a level by distance, whose views are of another scale
+    dares: bool = True  # whether a run that is stuck (`Steering.is_stuck`) goes on at full rates; else it ends
     pixel: float | None = None  # world units: the means move by such; None: by the pixel of the new scale at the median splat
 
     @cached_property

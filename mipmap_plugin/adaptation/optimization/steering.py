@@ -71,13 +71,17 @@ class Steering:
         lower = rising and self.best_step > 0 and self.best_factor < rate_factor
         self.ceiling = self.best_factor if lower else RATE_REDUCTION * rate_factor
 
-    def dare(self, progress: float, config: AdaptConfig) -> None:
-        """Stop limiting rates and undoing steps if limited rates hardly gained anything while new views came: there is little to lose.
+    def is_stuck(self, progress: float, config: AdaptConfig) -> bool:
+        """Whether limited rates hardly gained anything while new views came."""
+        tried = config.warm_up > 0 and 0 < config.gathering <= progress
+        return tried and self.ceiling < 1 and self._gained_db() <= LOST_DB
+
+    def dare(self) -> None:
+        """Stop limiting rates and undoing steps of a run that is stuck, which has little to lose.
 
         Where few views show each splat, any rate does harm at first, but high ones gain in the end, as they fall.
         """
-        if config.warm_up and config.gathering and self.ceiling < 1 and progress >= config.gathering and self._gained_db() <= LOST_DB:
-            self.ceiling, self.bold = 1.0, True
+        self.ceiling, self.bold = 1.0, True
 
     def _gained_db(self) -> float:
         """The gain of the best state over the start, dB, by the whole error: the visible error of a good start hardly changes."""

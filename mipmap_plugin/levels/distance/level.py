@@ -123,7 +123,8 @@ class LevelRun:
         self.seconds["start"] = self.seconds["total"] = now(self.finest.means.device) - began
         if self.config.steps:
             # The median splat may be far away, where this level is not shown.
-            task = Task(self.views, 1.0, self.truth, [self._render], False, self.validation, part=f"level {self.number}", pixel=self.size)
+            part = f"level {self.number}"  # which does not dare: beside finer levels that are right there is much to lose
+            task = Task(self.views, 1.0, self.truth, [self._render], False, self.validation, part=part, dares=False, pixel=self.size)
             keeper = StateKeeper(resume, self._fingerprint())
             run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
             ended_by = adapt(run, task, self.config, keeper.save_and_stop, keeper.save_if_due).told(self.config, run.step)

@@ -72,28 +72,26 @@ def test_a_limit_that_was_found_before_anything_was_gained_rises_with_what_is_ga
 
 
 @pytest.mark.parametrize(
-    ("gained", "progress", "warm_up", "bold"),
+    ("gained", "progress", "warm_up", "stuck"),
     [(0.0, 0.25, 0.1, True), (0.2, 0.25, 0.1, True), (0.3, 0.25, 0.1, False), (0.0, 0.24, 0.1, False), (0.0, 0.25, 0.0, False)],
 )
-def test_where_limited_rates_hardly_gained_high_ones_are_tried_and_nothing_is_taken_back(gained, progress, warm_up, bold):
+def test_where_limited_rates_hardly_gained_high_ones_are_tried_and_nothing_is_taken_back(gained, progress, warm_up, stuck):
     run, config = steering(ceiling=0.1), recipe("default", SCALE, steps=16, warm_up=warm_up)
     run.update_best(30 + gained, 4, tiny.model(2, seed=1))
-    run.dare(progress, config)
-    assert (run.bold, run.ceiling) == (bold, 1.0 if bold else 0.1)
-    assert run.is_harmful(10.0) != bold
+    assert run.is_stuck(progress, config) == stuck and run.is_harmful(10.0)
+    run.dare()
+    assert run.ceiling == 1.0 and not run.is_harmful(10.0)
 
 
 def test_what_is_hardly_to_be_seen_may_be_much_of_what_is_left_of_the_error():
     run = Steering(41.5, 41.6, Snapshot.of(tiny.model(2)), ceiling=0.1)  # 50.3 dB without VISIBLE_ERROR, and 51.1
-    run.dare(0.25, recipe("default", SCALE, steps=16))
-    assert not run.bold
+    assert not run.is_stuck(0.25, recipe("default", SCALE, steps=16))
 
 
 @pytest.mark.parametrize(("ceiling", "gathering"), [(1.0, 0.25), (0.5, 0.0)], ids=["nothing limits", "no new views come"])
 def test_rates_that_had_no_time_to_gain_are_steered_on(ceiling, gathering):
     run = steering(ceiling=ceiling)
-    run.dare(1.0, recipe("default", SCALE, gathering=gathering))
-    assert not run.bold
+    assert not run.is_stuck(1.0, recipe("default", SCALE, gathering=gathering))
 
 
 @pytest.mark.parametrize("rows", [5, 3])
