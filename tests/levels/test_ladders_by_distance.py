@@ -118,13 +118,15 @@ def test_centers_move_by_pixels_of_the_level(small_chunks, monkeypatch):
     assert pixels[-2:] == [rule.middle(1), rule.middle(2)]
 
 
-def test_states_are_chosen_by_whole_pictures(small_chunks):
+def test_runs_are_steered_and_states_chosen_by_whole_pictures(small_chunks):
     """By its share of each pixel, a level that spoils what lies behind it looks as good as another."""
     base, request = wrapped(near=100, far=60), LadderRequest.of("classic", by="distance", coarsest=1 / 4, ratio=2.0, **BRIEF)
     run = LevelRun(scene_of(base, request, request.first_band(base)), 1, [base.model])
     report = (made := run.run(None)).report
-    [shown], [share] = (each.viewer_psnrs(made.model, each.choosing) for each in (run.whole, run.validation))
-    assert report.validation[report.returned] == pytest.approx(shown) != pytest.approx(share)
+    assert report.returned.startswith("the start")
+    for views, told in (("choosing", report.validation[report.returned]), ("steering", report.curve[0].validation_db)):
+        [shown], [share] = (each.viewer_psnrs(made.model, getattr(each, views)) for each in (run.whole, run.validation))
+        assert told == pytest.approx(shown) != pytest.approx(share)
 
 
 def test_a_level_keeps_no_pictures_when_it_is_made(small_chunks, monkeypatch):
