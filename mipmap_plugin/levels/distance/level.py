@@ -122,8 +122,8 @@ class LevelRun:
         states = {f"the start, {name}": initial}
         self.seconds["start"] = self.seconds["total"] = now(self.finest.means.device) - began
         if self.config.steps:
-            # Steered by whole pictures, as states are chosen: by the level's share of them steps seem to gain that do harm beside it. The median splat
-            # may be far away, where the level is not shown. Beside finer levels that are right there is much to lose, so it does not dare.
+            # Steered by whole pictures, as states are chosen: by the level's share of them steps seem to gain that do harm beside it. The median
+            # splat may be far away, where the level is not shown. Beside finer levels that are right there is much to lose, so it does not dare.
             part = f"level {self.number}"
             task = Task(self.views, 1.0, self.truth, [self._render], False, self.whole, part=part, pixel=self.size, dares=False)
             keeper = StateKeeper(resume, self._fingerprint())
