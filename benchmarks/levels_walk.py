@@ -176,8 +176,8 @@ def page(results: Sequence[dict[str, Any]]) -> str:
 
 def section(result: dict[str, Any]) -> str:
     head = ["", "worst, dB", "mean, dB", "first, dB", "x1/2", "x1/4", "last", "flicker, mean", "worst", "splats", "switches", "least likeness, dB"]
-    facts = f"{result['chunks']} chunks of at most {result['extent']} world units; levels of {result['counts']} splats, {result['steps']} steps each."
-    said = f"{facts} {result['note']}".strip()
+    facts = f"{result['chunks']} chunks of at most {result['extent']} world units; levels of {result['counts']} splats, {result['steps']} steps each"
+    said = f"{facts} at most. {result['note']}".strip()
     return f"## {result['base']} in {result['viewer']}\n\n{said}\n\n{markdown(head, [row(film) for film in result['films']])}\n"
 
 

@@ -41,5 +41,5 @@ def test_the_page_has_a_row_for_every_film(scene):
     found = film(scene, "by distance", Mixture.of(DistanceRule(1.0, 2.0, 1), Chunks.of(scene.splats, 9.0), [scene.splats]), walks(scene)[:1])
     facts = {"base": "ball", "viewer": "classic", "chunks": 1, "extent": 9, "counts": "80", "films": [asdict(found)], "steps": 5, "note": "Small."}
     text = page([facts])
-    assert "## ball in classic" in text and "5 steps each. Small." in text and "| by distance" in text
+    assert "## ball in classic" in text and "5 steps each at most. Small." in text and "| by distance" in text
     assert torch.isfinite(torch.tensor(found.frames[1].flicker))
